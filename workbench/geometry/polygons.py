@@ -1,0 +1,105 @@
+"""Polygons: normals, areas, planarity, and the cutting of concave ones into convex pieces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mapbox_earcut
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.errors import InputError
+
+__all__ = ["check_polygon", "convex_pieces", "is_convex", "plane_basis", "vector_area"]
+
+FloatArray = NDArray[np.float64]
+
+PLANARITY = 1e-5
+"""Largest distance of a vertex from its polygon's plane, as a share of the polygon's size."""
+
+
+def vector_area(rings: Sequence[FloatArray] | FloatArray) -> FloatArray:
+    """Vector area (3,) of a polygon with holes: its length is the area, its direction the normal.
+
+    Newell's sum, taken about the first vertex so that far-away polygons lose no digits.
+    """
+    if isinstance(rings, np.ndarray):
+        rings = [rings]
+    origin = rings[0][0]
+    total = np.zeros(3)
+    for ring in rings:
+        moved = ring - origin
+        total += 0.5 * np.cross(moved, np.roll(moved, -1, axis=0)).sum(axis=0)
+    return total
+
+
+def plane_basis(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors (3,) that make a right-handed frame with the unit ``normal``."""
+    helper = np.zeros(3)
+    helper[int(np.argmin(np.abs(normal)))] = 1.0
+    u = np.cross(helper, normal)
+    u /= np.linalg.norm(u)
+    return u, np.cross(normal, u)
+
+
+def is_convex(ring: FloatArray, normal: FloatArray) -> bool:
+    """Whether a ring (n, 3) turns the same way at each corner; collinear corners are allowed."""
+    edge = np.roll(ring, -1, axis=0) - ring
+    turn = np.cross(edge, np.roll(edge, -1, axis=0)) @ normal
+    length = np.linalg.norm(edge, axis=1)
+    if (turn < -1e-12 * length * np.roll(length, -1)).any():
+        return False
+    # All turns to the left but more than one full turn (a pentagram) is not convex either.
+    angle = np.arctan2(turn, np.einsum("ij,ij->i", edge, np.roll(edge, -1, axis=0)))
+    return bool(abs(angle.sum() - 2 * np.pi) < 1e-6)
+
+
+def check_polygon(rings: Sequence[FloatArray]) -> str | None:
+    """What is wrong with a polygon, in a few words, or ``None``.
+
+    Tested: at least three vertices a ring, finite coordinates, an area, planarity to
+    :data:`PLANARITY` of its size.
+    """
+    for ring in rings:
+        if len(ring) < 3:
+            return f"a ring of {len(ring)} vertices, expected 3 or more"
+        if not np.isfinite(ring).all():
+            return "a coordinate that is not finite"
+    vector = vector_area(rings)
+    area = float(np.linalg.norm(vector))
+    points = np.concatenate(list(rings))
+    extent = float(np.ptp(points, axis=0).max())
+    if not area > 1e-14 * extent * extent:
+        return "a polygon of zero area"
+    off = float(np.abs((points - points[0]) @ (vector / area)).max())
+    if off > PLANARITY * extent:
+        return f"a non-planar polygon: a vertex lies {off:.3g} off the plane, {off / extent:.2g} of its size"
+    return None
+
+
+def convex_pieces(rings: Sequence[FloatArray]) -> list[FloatArray]:
+    """A polygon as convex pieces with its orientation: itself, or triangles by ear cutting.
+
+    Raises
+    ------
+    InputError
+        If the triangles do not add up to the polygon's area (a ring that crosses itself).
+    """
+    vector = vector_area(rings)
+    area = float(np.linalg.norm(vector))
+    normal = vector / area
+    if len(rings) == 1 and is_convex(rings[0], normal):
+        return [np.ascontiguousarray(rings[0], dtype=np.float64)]
+    u, v = plane_basis(normal)
+    points = np.concatenate(list(rings))
+    flat = np.column_stack([(points - points[0]) @ u, (points - points[0]) @ v])
+    ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
+    triangles = mapbox_earcut.triangulate_float64(flat, ends).reshape(-1, 3)
+    corners = points[triangles]
+    vectors = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    signed = vectors @ normal
+    if abs(np.abs(signed).sum() - area) > 1e-6 * area:
+        raise InputError("a polygon whose rings cross themselves or each other")
+    keep = np.abs(signed) > 1e-14 * area
+    corners[signed < 0] = corners[signed < 0][:, ::-1]
+    return [np.ascontiguousarray(corner) for corner in corners[keep]]

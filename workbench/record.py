@@ -1,0 +1,105 @@
+"""The RunRecord: what a run was asked, what it did, what it cost and how wrong it may be."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from workbench.counters import Counters
+
+__all__ = ["RunRecord", "write_text_atomically"]
+
+_LIBRARIES = ("radiosity-workbench", "numpy", "scipy", "numba", "embreex", "trimesh", "pyvista", "vtk")
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _machine() -> dict[str, Any]:
+    name = platform.processor() or platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                name = line.split(":", 1)[1].strip()
+                break
+    except OSError:
+        pass
+    return {"processor": name, "cores": os.cpu_count(), "system": platform.platform()}
+
+
+def write_text_atomically(path: str | Path, text: str) -> None:
+    """Write beside the target, then rename: a reader never sees half a file."""
+    path = Path(path)
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        beside.write_text(text, encoding="utf-8")
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+@dataclass
+class RunRecord:
+    """Settings, versions, seconds by stage, counters and error estimates of one run.
+
+    ``seconds`` maps a stage to wall-clock seconds; ``errors`` maps the name of an error estimate
+    (with its definition in the name) to its value; ``choices`` says what was chosen
+    automatically and why.
+    """
+
+    command: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    counters: Counters = field(default_factory=Counters)
+    errors: dict[str, Any] = field(default_factory=dict)
+    choices: dict[str, str] = field(default_factory=dict)
+    results: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=_versions)
+    machine: dict[str, Any] = field(default_factory=_machine)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the wall-clock seconds of the ``with`` block to stage ``name``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def as_dict(self) -> dict[str, Any]:
+        """The record as plain JSON-ready values."""
+        return {
+            "command": self.command,
+            "settings": self.settings,
+            "choices": self.choices,
+            "seconds": {name: round(value, 6) for name, value in self.seconds.items()},
+            "counters": dict(self.counters),
+            "errors": self.errors,
+            "results": self.results,
+            "versions": self.versions,
+            "machine": self.machine,
+        }
+
+    def write(self, path: str | Path) -> None:
+        """Write the record as JSON, whole or not at all; ``-`` means standard output."""
+        text = json.dumps(self.as_dict(), indent=2, default=float) + "\n"
+        if str(path) == "-":
+            sys.stdout.write(text)
+        else:
+            write_text_atomically(path, text)
