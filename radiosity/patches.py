@@ -1,0 +1,462 @@
+"""Patches and elements: the two-level mesh on which radiosity is solved.
+
+*Elements* receive light and hold radiosity; *patches*, groups of neighbouring elements, shoot it
+(M. F. Cohen, D. P. Greenberg, D. S. Immel and P. J. Brock, "An efficient radiosity approach for
+realistic image synthesis", IEEE CG&A 1986).  Quads stay quads.  A patch of a flat surface is one
+polygon that its elements tile; a patch of a tessellated surface is a cluster of small facets.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from workbench.errors import OptionError
+from workbench.geometry.flat import Geometry
+from workbench.geometry.polygons import convex_pieces, plane_basis, vector_area
+from workbench.scene.model import Scene
+
+__all__ = ["PatchMesh", "build_mesh", "forecast_elements"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class PatchMesh:
+    """Elements (receivers) and patches (senders) as flat arrays.
+
+    Elements are sorted by patch: patch ``p`` owns ``patch_start[p]:patch_start[p + 1]``.
+
+    Parameters
+    ----------
+    corners : (k, 3) float
+        Corners of the elements' convex pieces, counter-clockwise from the lit side.
+    piece_start : (m + 1,) int
+    piece_element : (m,) int
+        Owner of each piece, ascending; nearly every element is one piece.
+    element_area : (n,) float
+        [scene lengths squared]
+    element_normal, element_centroid : (n, 3) float
+    element_size : (n,) float
+        Largest distance of a corner from the centroid, doubled.
+    element_polygon : (n,) int
+        Polygon of the :class:`Geometry`.
+    element_surface : (n,) int
+    element_side : (n,) int
+        1 for the front of its polygon, -1 for the back of a two-sided one.
+    element_patch : (n,) int
+    reflectance, emission : (n, bands) float
+        Diffuse reflectance [0..1] and radiant exitance [W m-2].
+    patch_start : (q + 1,) int
+    sender_corners, sender_start, sender_normal, patch_sender
+        Convex pieces of the patches as senders, in the same layout; patch ``p`` has pieces
+        ``patch_sender[p]:patch_sender[p + 1]``.
+    patch_polygon : (q,) int
+        Polygon of a flat patch, -1 for a cluster of facets.
+    facet_error : float
+        Largest distance of an exact surface from its facets. [scene lengths]
+    """
+
+    corners: FloatArray
+    piece_start: IntArray
+    piece_element: IntArray
+    element_area: FloatArray
+    element_normal: FloatArray
+    element_centroid: FloatArray
+    element_size: FloatArray
+    element_polygon: IntArray
+    element_surface: IntArray
+    element_side: IntArray
+    element_patch: IntArray
+    reflectance: FloatArray
+    emission: FloatArray
+    patch_start: IntArray
+    sender_corners: FloatArray
+    sender_start: IntArray
+    sender_normal: FloatArray
+    patch_sender: IntArray
+    patch_polygon: IntArray
+    facet_error: float
+
+    @property
+    def element_count(self) -> int:
+        """Number of elements."""
+        return len(self.element_area)
+
+    @property
+    def patch_count(self) -> int:
+        """Number of patches."""
+        return len(self.patch_start) - 1
+
+    @property
+    def bands(self) -> int:
+        """Number of spectral bands."""
+        return self.reflectance.shape[1]
+
+    @cached_property
+    def element_piece(self) -> IntArray:
+        """(n + 1,) int: element ``e`` has pieces ``element_piece[e]:element_piece[e + 1]``."""
+        return np.searchsorted(self.piece_element, np.arange(self.element_count + 1)).astype(np.int64)
+
+    @cached_property
+    def patch_area(self) -> FloatArray:
+        """(q,) float: area of each patch, the sum of its elements'."""
+        return np.add.reduceat(self.element_area, self.patch_start[:-1])
+
+    @cached_property
+    def patch_bounds(self) -> FloatArray:
+        """(q, 2, 3) float: box round each patch."""
+        first = self.patch_sender[:-1]
+        low = np.minimum.reduceat(np.minimum.reduceat(self.sender_corners, self.sender_start[:-1], axis=0), first)
+        high = np.maximum.reduceat(np.maximum.reduceat(self.sender_corners, self.sender_start[:-1], axis=0), first)
+        return np.ascontiguousarray(np.stack([low, high], axis=1))
+
+    @cached_property
+    def patch_normal(self) -> FloatArray:
+        """(q, 3) float: normal of a flat patch; mean direction of a cluster."""
+        total = np.add.reduceat(self.element_normal * self.element_area[:, None], self.patch_start[:-1])
+        length = np.linalg.norm(total, axis=1)
+        return np.ascontiguousarray(total / np.where(length > 0, length, 1.0)[:, None])
+
+    def patch_mean(self, values: FloatArray) -> FloatArray:
+        """Area-weighted mean over each patch's elements: (n, bands) to (q, bands)."""
+        weighted = values * self.element_area[:, None]
+        return np.add.reduceat(weighted, self.patch_start[:-1]) / self.patch_area[:, None]
+
+
+@dataclass
+class _Part:
+    """What one polygon (or cluster) adds: element rings, patch of each, sender rings a patch."""
+
+    elements: list[list[FloatArray]]
+    patch_of: list[int]
+    senders: list[list[FloatArray]]
+
+
+def _steps(length: float, edge: float, split: int) -> int:
+    """Number of intervals of at most ``edge``, a multiple of ``split`` if more than one."""
+    count = max(1, math.ceil(length / edge - 1e-9))
+    return count if count == 1 else split * math.ceil(count / split)
+
+
+def _bilinear(quad: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    u, v = u[..., None], v[..., None]
+    return (quad[0] * (1 - u) + quad[1] * u) * (1 - v) + (quad[3] * (1 - u) + quad[2] * u) * v
+
+
+def _quad_cells(quad: FloatArray, nu: int, nv: int) -> FloatArray:
+    """(nv, nu, 4, 3) cells of a quad."""
+    grid = _bilinear(quad, *np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1)))
+    return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2)
+
+
+def _quad_counts(quad: FloatArray, edge: float, split: int) -> tuple[int, int]:
+    side = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
+    return _steps(max(side[0], side[2]), edge, split), _steps(max(side[1], side[3]), edge, split)
+
+
+def _mesh_quad(quad: FloatArray, edge: float, split: int) -> _Part:
+    nu, nv = _quad_counts(quad, edge, split)
+    pu, pv = max(1, nu // split), max(1, nv // split)
+    cells = _quad_cells(quad, nu, nv)
+    coarse = _quad_cells(quad, pu, pv)
+    patch = [(j * pv // nv) * pu + i * pu // nu for j in range(nv) for i in range(nu)]
+    return _Part([[cell] for cell in cells.reshape(-1, 4, 3)], patch, [[cell] for cell in coarse.reshape(-1, 4, 3)])
+
+
+def _triangle_cells(tri: FloatArray, n: int) -> tuple[list[FloatArray], list[tuple[int, int, bool]]]:
+    a, u, v = tri[0], (tri[1] - tri[0]) / n, (tri[2] - tri[0]) / n
+    cells, index = [], []
+    for j in range(n):
+        for i in range(n - j):
+            corner = a + i * u + j * v
+            cells.append(np.stack([corner, corner + u, corner + v]))
+            index.append((i, j, True))
+            if i + j < n - 1:
+                cells.append(np.stack([corner + u, corner + u + v, corner + v]))
+                index.append((i, j, False))
+    return cells, index
+
+
+def _triangle_count(tri: FloatArray, edge: float, split: int) -> int:
+    return _steps(float(np.linalg.norm(np.roll(tri, -1, axis=0) - tri, axis=1).max()), edge, split)
+
+
+def _mesh_triangle(tri: FloatArray, edge: float, split: int) -> _Part:
+    n = _triangle_count(tri, edge, split)
+    coarse_n = max(1, n // split)
+    ratio = n // coarse_n
+    cells, index = _triangle_cells(tri, n)
+    coarse, coarse_index = _triangle_cells(tri, coarse_n)
+    place = {key: number for number, key in enumerate(coarse_index)}
+    patch = []
+    for i, j, up in index:
+        # Centroid in units of the coarse cell decides which coarse triangle it lies in.
+        s = (i + (1 / 3 if up else 2 / 3)) / ratio
+        t = (j + (1 / 3 if up else 2 / 3)) / ratio
+        ci, cj = int(s), int(t)
+        patch.append(place[(ci, cj, (s - ci) + (t - cj) < 1.0)])
+    return _Part([[cell] for cell in cells], patch, [[cell] for cell in coarse])
+
+
+def _grid_rows(rings: list[FloatArray], edge: float) -> tuple[FloatArray, FloatArray, FloatArray, int, int]:
+    """Frame along the longest edge, flat bounds and grid counts of any polygon."""
+    vector = vector_area(rings)
+    normal = vector / np.linalg.norm(vector)
+    sides = np.roll(rings[0], -1, axis=0) - rings[0]
+    u = sides[int(np.argmax(np.linalg.norm(sides, axis=1)))]
+    u = u / np.linalg.norm(u) if np.linalg.norm(u) > 0 else plane_basis(normal)[0]
+    frame = np.stack([u, np.cross(normal, u)])
+    flat = (np.concatenate(rings) - rings[0][0]) @ frame.T
+    low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
+    return frame, low, extent, _steps(float(extent[0]), edge, 1), _steps(float(extent[1]), edge, 1)
+
+
+def _mesh_polygon(rings: list[FloatArray], pieces: list[FloatArray], edge: float) -> _Part:
+    """Any polygon: cells of a grid along its longest edge, cut by its outline."""
+    frame, low, extent, nu, nv = _grid_rows(rings, edge)
+    if nu * nv == 1:
+        return _Part([pieces], [0], [pieces])
+    flat = [(ring - rings[0][0]) @ frame.T for ring in rings]
+    outline = shapely.Polygon(flat[0], flat[1:])
+    xs = low[0] + extent[0] * np.linspace(0, 1, nu + 1)
+    ys = low[1] + extent[1] * np.linspace(0, 1, nv + 1)
+    boxes = shapely.box(*(a.ravel() for a in (*np.meshgrid(xs[:-1], ys[:-1]), *np.meshgrid(xs[1:], ys[1:]))))
+    parts: list[list[FloatArray]] = []
+    for cut in shapely.intersection(boxes, outline):
+        for part in shapely.get_parts(cut):
+            if part.geom_type != "Polygon" or part.area <= 1e-12 * outline.area:
+                continue
+            part = shapely.geometry.polygon.orient(part)
+            loops = [np.asarray(part.exterior.coords)[:-1]] + [np.asarray(r.coords)[:-1] for r in part.interiors]
+            parts.append(convex_pieces([rings[0][0] + loop @ frame for loop in loops]))
+    return _Part(parts, list(range(len(parts))), parts)
+
+
+def _polygon_count(rings: list[FloatArray], edge: float, split: int) -> int:
+    if len(rings) == 1 and len(rings[0]) == 3:
+        return _triangle_count(rings[0], edge, split) ** 2
+    if len(rings) == 1 and len(rings[0]) == 4:
+        nu, nv = _quad_counts(rings[0], edge, split)
+        return nu * nv
+    _, _, extent, nu, nv = _grid_rows(rings, edge)
+    covered = float(np.linalg.norm(vector_area(rings))) / float(extent[0] * extent[1])
+    return max(1, math.ceil(covered * nu * nv))
+
+
+def forecast_elements(scene: Scene, edge: float, split: int = 2) -> int:
+    """About how many elements :func:`build_mesh` makes for a largest edge, without making them."""
+    total = 0
+    for surface in scene.surfaces:
+        sides = 2 if surface.material.two_sided else 1
+        sizes = np.diff(surface.ring_offsets)
+        if len(sizes) == surface.face_count and (sizes == 3).all():
+            tri = surface.vertices[surface.ring_vertices].reshape(-1, 3, 3)
+            longest = np.linalg.norm(np.roll(tri, -1, axis=1) - tri, axis=2).max(axis=1)
+            n = np.maximum(1, np.ceil(longest / edge - 1e-9))
+            n = np.where(n > 1, split * np.ceil(n / split), 1)
+            total += sides * int((n * n).sum())
+        else:
+            total += sides * sum(_polygon_count(rings, edge, split) for rings in surface.faces())
+    return total
+
+
+def _edge_for(scene: Scene, geometry: Geometry, elements: int, split: int) -> float:
+    """Largest edge that gives about the asked number of elements, by bisection."""
+    high = 2.0 * geometry.size
+    if forecast_elements(scene, high, split) >= elements:
+        return math.inf
+    low = math.sqrt(float(geometry.polygon_area.sum()) / (4.0 * elements))
+    while forecast_elements(scene, low, split) < elements:
+        low *= 0.5
+    for _ in range(40):
+        middle = math.sqrt(low * high)
+        if forecast_elements(scene, middle, split) > elements:
+            low = middle
+        else:
+            high = middle
+        if high / low < 1.005:
+            break
+    return high
+
+
+def _clusters(centroid: FloatArray, normal: FloatArray, cell: float) -> IntArray:
+    """Cluster number of facets that share a cube of side ``cell`` and face about the same way."""
+    place = np.floor((centroid - centroid.min(axis=0)) / cell).astype(np.int64)
+    # Three bins a component: facets of one cluster lie within about 45 degrees of each other.
+    facing = np.floor((normal + 1.0) * 1.4999).astype(np.int64)
+    key = np.concatenate([place, facing], axis=1)
+    return np.unique(key, axis=0, return_inverse=True)[1].ravel()
+
+
+def build_mesh(
+    scene: Scene,
+    geometry: Geometry,
+    *,
+    elements: int | None = None,
+    max_edge: float | None = None,
+    split: int = 2,
+) -> PatchMesh:
+    """Divide a scene's polygons into elements and patches.
+
+    Parameters
+    ----------
+    scene, geometry : Scene, Geometry
+        A scene and its flattened form.
+    elements : int, optional
+        About how many elements to make; never fewer than one a polygon (and side).
+    max_edge : float, optional
+        Longest element edge instead. [scene lengths]  Neither: one element a polygon.
+    split : int
+        Elements along the edge of a patch.
+
+    Raises
+    ------
+    OptionError
+        If both are given, or one is not positive.
+    """
+    if elements is not None and max_edge is not None:
+        raise OptionError("elements and max_edge were both given; choose one of them")
+    if elements is not None and elements < 1:
+        raise OptionError(f"elements: found {elements}, expected 1 or more")
+    if max_edge is not None and not max_edge > 0:
+        raise OptionError(f"max_edge: found {max_edge}, expected a positive length")
+    edge = math.inf
+    if max_edge is not None:
+        edge = max_edge
+    elif elements is not None:
+        edge = _edge_for(scene, geometry, elements, split)
+    edge = min(edge, 4.0 * geometry.size)
+
+    rings: list[list[FloatArray]] = []
+    polygon: list[int] = []
+    side: list[int] = []
+    patch: list[int] = []
+    senders: list[list[FloatArray]] = []
+    patch_polygon: list[int] = []
+    number = 0
+    for surface in scene.surfaces:
+        sides = (1, -1) if surface.material.two_sided else (1,)
+        faces = range(surface.face_count)
+        sizes = np.diff(surface.ring_offsets)
+        fine: set[int] = set()
+        # Small facets of a tessellated surface shoot together, as clusters.
+        if surface.face_count >= 64 and len(sizes) == surface.face_count:
+            corner = surface.vertices[surface.ring_vertices]
+            starts = surface.ring_offsets[:-1]
+            extent = np.maximum.reduceat(corner, starts) - np.minimum.reduceat(corner, starts)
+            small = np.flatnonzero(extent.max(axis=1) <= edge)
+            if len(small) >= 64:
+                fine = set(small.tolist())
+                area = float(geometry.polygon_area[number + small].sum())
+                # Large enough that a cluster gathers a dozen facets, small against the surface.
+                cell = max(min(edge, math.sqrt(area / 24)), math.sqrt(12 * area / len(small)))
+                centroid = np.add.reduceat(corner, starts)[small] / sizes[small, None]
+                cluster = _clusters(centroid, geometry.polygon_normal[number + small], cell)
+                for sign in sides:
+                    base = len(senders)
+                    groups: list[list[FloatArray]] = [[] for _ in range(int(cluster.max()) + 1)]
+                    for face, group in zip(small.tolist(), cluster.tolist(), strict=True):
+                        ring = surface.face(face)[0][::sign]
+                        rings.append([ring])
+                        polygon.append(number + face)
+                        side.append(sign)
+                        patch.append(base + group)
+                        groups[group].append(ring)
+                    senders.extend(groups)
+                    patch_polygon.extend([-1] * len(groups))
+        for face in faces:
+            if face in fine:
+                continue
+            loops = surface.face(face)
+            a, b = geometry.polygon_piece_start[number + face : number + face + 2]
+            pieces = [geometry.piece(i) for i in range(a, b)]
+            if len(loops) == 1 and len(loops[0]) == 3:
+                part = _mesh_triangle(loops[0], edge, split)
+            elif len(loops) == 1 and len(loops[0]) == 4 and len(pieces) == 1:
+                part = _mesh_quad(loops[0], edge, split)
+            else:
+                part = _mesh_polygon(loops, pieces, edge)
+            for sign in sides:
+                base = len(senders)
+                rings.extend([loop[::sign] for loop in element] for element in part.elements)
+                polygon.extend([number + face] * len(part.elements))
+                side.extend([sign] * len(part.elements))
+                patch.extend(base + p for p in part.patch_of)
+                senders.extend([loop[::sign] for loop in sender] for sender in part.senders)
+                patch_polygon.extend([number + face] * len(part.senders))
+        number += surface.face_count
+
+    order = np.argsort(np.asarray(patch, dtype=np.int64), kind="stable")
+    rings = [rings[i] for i in order]
+    element_patch = np.asarray(patch, dtype=np.int64)[order]
+    element_polygon = np.asarray(polygon, dtype=np.int64)[order]
+    element_side = np.asarray(side, dtype=np.int64)[order]
+    element_surface = geometry.polygon_surface[element_polygon]
+    flat = [loop for element in rings for loop in element]
+    piece_start = np.concatenate([[0], np.cumsum([len(loop) for loop in flat])]).astype(np.int64)
+    corners = np.ascontiguousarray(np.concatenate(flat))
+    piece_element = np.repeat(np.arange(len(rings)), [len(element) for element in rings]).astype(np.int64)
+    area, centroid = _area_and_centroid(corners, piece_start, piece_element, len(rings))
+    away = np.linalg.norm(corners - centroid[np.repeat(piece_element, np.diff(piece_start))], axis=1)
+    first_corner = piece_start[np.searchsorted(piece_element, np.arange(len(rings)))]
+    sender_flat = [loop for sender in senders for loop in sender]
+    sender_start = np.concatenate([[0], np.cumsum([len(loop) for loop in sender_flat])]).astype(np.int64)
+    sender_corners = np.ascontiguousarray(np.concatenate(sender_flat))
+    vectors = _vector_areas(sender_corners, sender_start)
+    materials = [surface.material for surface in scene.surfaces]
+    return PatchMesh(
+        corners=corners,
+        piece_start=piece_start,
+        piece_element=piece_element,
+        element_area=area,
+        element_normal=np.ascontiguousarray(geometry.polygon_normal[element_polygon] * element_side[:, None]),
+        element_centroid=centroid,
+        element_size=2.0 * np.maximum.reduceat(away, first_corner),
+        element_polygon=element_polygon,
+        element_surface=element_surface,
+        element_side=element_side,
+        element_patch=element_patch,
+        reflectance=np.ascontiguousarray(np.stack([m.reflectance for m in materials])[element_surface]),
+        emission=np.ascontiguousarray(np.stack([m.emission for m in materials])[element_surface]),
+        patch_start=np.searchsorted(element_patch, np.arange(len(senders) + 1)).astype(np.int64),
+        sender_corners=sender_corners,
+        sender_start=sender_start,
+        sender_normal=np.ascontiguousarray(vectors / np.linalg.norm(vectors, axis=1)[:, None]),
+        patch_sender=np.concatenate([[0], np.cumsum([len(sender) for sender in senders])]).astype(np.int64),
+        patch_polygon=np.asarray(patch_polygon, dtype=np.int64),
+        facet_error=max((surface.facet_error for surface in scene.surfaces), default=0.0),
+    )
+
+
+def _fans(corners: FloatArray, starts: IntArray) -> tuple[FloatArray, IntArray]:
+    """Fan triangles (t, 3, 3) of rings, and the ring (t,) of each."""
+    counts = np.diff(starts) - 2
+    ring = np.repeat(np.arange(len(counts)), counts)
+    first = np.repeat(starts[:-1], counts)
+    step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return corners[np.stack([first, first + step + 1, first + step + 2], axis=1)], ring
+
+
+def _vector_areas(corners: FloatArray, starts: IntArray) -> FloatArray:
+    tri, ring = _fans(corners, starts)
+    out = np.zeros((len(starts) - 1, 3))
+    np.add.at(out, ring, 0.5 * np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]))
+    return out
+
+
+def _area_and_centroid(
+    corners: FloatArray, starts: IntArray, owner: IntArray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    tri, ring = _fans(corners, starts)
+    part = 0.5 * np.linalg.norm(np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]), axis=1)
+    who = owner[ring]
+    area = np.bincount(who, part, count)
+    centroid = np.stack([np.bincount(who, part * tri.mean(axis=1)[:, k], count) for k in range(3)], axis=1)
+    return area, np.ascontiguousarray(centroid / area[:, None])

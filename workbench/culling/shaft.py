@@ -1,0 +1,68 @@
+"""Shaft culling: which pieces may come between a group of receivers and a sender.
+
+Source: E. A. Haines and J. R. Wallace, "Shaft culling for efficient ray-traced radiosity"
+(Eurographics Workshop on Rendering 1991).  The shaft of two boxes is the convex hull of both: the
+box round both, cut by planes that link an edge of one to an edge of the other.  A linking plane is
+taken only when every corner of both boxes lies on its inner side, so overlapping, touching and
+flat boxes need no case of their own: planes that would cut into the hull are never made.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+__all__ = ["MAX_SHAFT_PLANES", "box_shaft"]
+
+MAX_SHAFT_PLANES = 6 + 12 + 2
+"""Union box, linking planes, and the planes of a flat receiver and sender."""
+
+
+@njit(nogil=True, cache=True)
+def box_shaft(alow, ahigh, blow, bhigh, planes):
+    """Planes (nx, ny, nz, d), inside ``n . x >= d``, of the shaft between two boxes; their number."""
+    used = 0
+    size = 0.0
+    for axis in range(3):
+        lo, hi = min(alow[axis], blow[axis]), max(ahigh[axis], bhigh[axis])
+        size = max(size, hi - lo)
+        for k in range(4):
+            planes[used, k] = 0.0
+            planes[used + 1, k] = 0.0
+        planes[used, axis], planes[used, 3] = 1.0, lo
+        planes[used + 1, axis], planes[used + 1, 3] = -1.0, -hi
+        used += 2
+    corner = np.empty((8, 2))
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for c in range(4):
+            corner[c, 0] = ahigh[u] if c & 1 else alow[u]
+            corner[c, 1] = ahigh[v] if c & 2 else alow[v]
+            corner[c + 4, 0] = bhigh[u] if c & 1 else blow[u]
+            corner[c + 4, 1] = bhigh[v] if c & 2 else blow[v]
+        for c in range(4):
+            du, dv = corner[c + 4, 0] - corner[c, 0], corner[c + 4, 1] - corner[c, 1]
+            length = math.sqrt(du * du + dv * dv)
+            # An axis-aligned link is a side of the union box, which is there already.
+            if du == 0.0 or dv == 0.0 or length <= 1e-9 * size:
+                continue
+            pu, pv = -dv / length, du / length
+            d = pu * corner[c, 0] + pv * corner[c, 1]
+            lowest, highest = 0.0, 0.0
+            for k in range(8):
+                off = pu * corner[k, 0] + pv * corner[k, 1] - d
+                lowest = min(lowest, off)
+                highest = max(highest, off)
+            if lowest < -1e-12 * size and highest > 1e-12 * size:
+                continue
+            if lowest < -1e-12 * size:
+                pu, pv, d = -pu, -pv, -d
+                lowest = -highest
+            for k in range(4):
+                planes[used, k] = 0.0
+            planes[used, u], planes[used, v] = pu, pv
+            planes[used, 3] = d + min(lowest, 0.0)
+            used += 1
+    return used
