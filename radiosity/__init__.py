@@ -1,1 +1,41 @@
-"""."""
+"""Radiosity on the workbench: meshes of patches, form factors, solvers, pictures and reports.
+
+>>> import workbench, radiosity
+>>> scene = workbench.load("cornell-box")                    # doctest: +SKIP
+>>> solution = radiosity.solve(scene, elements=2000)         # doctest: +SKIP
+>>> solution.save("out/cornell")                             # doctest: +SKIP
+
+The public names are imported when they are first used, so that ``import radiosity`` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from radiosity.patches import PatchMesh
+    from radiosity.solvers.solution import ProgressEvent, Solution, solve
+    from radiosity.view import render_preview
+
+__all__ = ["PatchMesh", "ProgressEvent", "Solution", "render_preview", "solve"]
+
+_HOME = {
+    "PatchMesh": "radiosity.patches",
+    "ProgressEvent": "radiosity.solvers.solution",
+    "Solution": "radiosity.solvers.solution",
+    "render_preview": "radiosity.view",
+    "solve": "radiosity.solvers.solution",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
