@@ -257,7 +257,7 @@ def _progress() -> Iterator[Any]:
         nonlocal asked
         asked = True
         signal.signal(signal.SIGINT, before)
-        _complain("stopping after this step; press Ctrl-C again to quit at once")
+        os.write(2, b"\nradiosity: stopping after this step; press Ctrl-C again to quit at once\n")
 
     before = signal.signal(signal.SIGINT, on_interrupt)
     bar = tqdm(

@@ -87,7 +87,7 @@ def corner_values(mesh: PatchMesh, values: NDArray[np.float64]) -> NDArray[np.fl
     low = mesh.corners.min(axis=0)
     size = float(np.ptp(mesh.corners, axis=0).max()) or 1.0
     place = np.rint((mesh.corners - low) * (1e6 / size)).astype(np.int64)
-    place = np.column_stack([mesh.element_surface[element], place])
+    place = np.column_stack([mesh.element_surface[element], mesh.element_side[element], place])
     vertex = _labels(place)
     area = mesh.element_area[element]
     normal = mesh.element_normal[element]

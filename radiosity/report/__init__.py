@@ -1,1 +1,1 @@
-"""."""
+"""Reports: error against a reference, and error against seconds."""
