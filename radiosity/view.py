@@ -232,7 +232,7 @@ def _srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def _white_level(luminance: NDArray[np.float64], emits: NDArray[np.bool_]) -> float:
-    """The luminance shown as white: the 99th percentile of what is seen by reflected light.
+    """The luminance shown as white: the 99th percentile of what is seen by reflected light is 0.8 of it.
 
     Where a few bright spots leave the rest in the dark it is lowered until the median is shown at
     6 % (a quarter of full brightness after the sRGB curve).
@@ -242,7 +242,7 @@ def _white_level(luminance: NDArray[np.float64], emits: NDArray[np.bool_]) -> fl
         seen = luminance[luminance > 0]
     if not seen.size:
         return 1.0
-    return min(float(np.percentile(seen, 99)), float(np.median(seen)) / 0.06)
+    return min(float(np.percentile(seen, 99)) / 0.8, float(np.median(seen)) / 0.06)
 
 
 def render_preview(
