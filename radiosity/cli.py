@@ -110,9 +110,7 @@ def main() -> None:
 )
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Threads.  [default: all cores]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of the rays.")
-@click.option(
-    "--json", "json_path", metavar="FILE", help="Write the run's record here too; - is standard output."
-)
+@click.option("--json", "json_path", metavar="FILE", help="Write the run's record here too; - is standard output.")
 @click.option("--resume", is_flag=True, help="Go on from the solution in DIR.")
 @click.option("--no-preview", is_flag=True, help="Draw no picture.")
 def solve(
@@ -143,6 +141,10 @@ def solve(
     start = time.perf_counter()
     loaded = workbench.load(scene)
     seconds_reading = time.perf_counter() - start
+    if loaded.camera is not None and not no_preview:
+        from workbench.render.camera import PinholeRays
+
+        PinholeRays.from_camera(loaded.camera)  # a camera that cannot see is better found before the solve
     with _writable(directory, None if json_path in (None, "-") else Path(str(json_path))):
         import radiosity
 

@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.errors import InputError, MissingLibraryError, OptionError
+from workbench.render.camera import PinholeRays
+from workbench.render.image import write_picture
 from workbench.scene.model import Camera
 
 if TYPE_CHECKING:
@@ -146,20 +148,14 @@ class _Caster:
         return found["primID"].astype(np.int64), np.stack([1 - u - v, u, v], axis=1)
 
 
-def _directions(camera: Camera, width: int, height: int, samples: int) -> NDArray[np.float64]:
+def _directions(camera: Camera, samples: int) -> NDArray[np.float64]:
     """Unit directions (height * samples * width * samples, 3) through a grid over each pixel."""
-    forward = camera.look_at - camera.eye
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, camera.up)
-    if np.linalg.norm(right) < 1e-9 * np.linalg.norm(camera.up):  # looking along "up": take any other
-        right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
-    right /= np.linalg.norm(right)
-    up = np.cross(right, forward)
-    half = np.tan(np.radians(camera.fov_deg) / 2)
-    y = (1 - 2 * (np.arange(height * samples) + 0.5) / (height * samples)) * half
-    x = (2 * (np.arange(width * samples) + 0.5) / (width * samples) - 1) * half * width / height
-    ray = forward + x[None, :, None] * right + y[:, None, None] * up
-    return (ray / np.linalg.norm(ray, axis=2, keepdims=True)).reshape(-1, 3)
+    y, x = np.meshgrid(
+        (np.arange(camera.height * samples) + 0.5) / samples,
+        (np.arange(camera.width * samples) + 0.5) / samples,
+        indexing="ij",
+    )
+    return PinholeRays.from_camera(camera).directions(x.ravel(), y.ravel())
 
 
 def automatic_camera(mesh: PatchMesh, radiosity: NDArray[np.float64], *, up: int = 2) -> Camera:
@@ -186,7 +182,7 @@ def automatic_camera(mesh: PatchMesh, radiosity: NDArray[np.float64], *, up: int
 
     def lit_share(camera: Camera) -> float:
         caster = _Caster(mesh, camera.eye)
-        triangle, _ = caster.cast(_directions(camera, 48, 36, 1))
+        triangle, _ = caster.cast(_directions(replace(camera, width=48, height=36), 1))
         return float(lit[caster.element[triangle[triangle >= 0]]].sum()) / triangle.size
 
     def camera_at(eye: NDArray[np.float64], fov_deg: float) -> Camera:
@@ -275,7 +271,7 @@ def render_preview(
     bar = 0 if colour else min(130, width // 3)
     camera = replace(camera, width=width - bar, height=height)
     caster = _Caster(mesh, np.asarray(camera.eye, dtype=np.float64))
-    triangle, weights = caster.cast(_directions(camera, camera.width, height, samples))
+    triangle, weights = caster.cast(_directions(camera, samples))
     hit = triangle >= 0
     corners = corner_values(mesh, solution.radiosity)
     if not colour:
@@ -336,16 +332,7 @@ def _with_colour_bar(
 
 def write_preview(solution: Solution, path: str | Path, *, width: int | None = None, height: int | None = None) -> None:
     """Write :func:`render_preview` as a PNG file, whole or not at all."""
-    from PIL import Image
-
-    path = Path(path)
-    picture = Image.fromarray(render_preview(solution, width, height))
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        picture.save(beside, format="PNG")
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    write_picture(path, render_preview(solution, width, height))
 
 
 # ---- pyvista ----------------------------------------------------------------------------------
@@ -445,7 +432,7 @@ def _plotter(directory: Path, field: str, *, off_screen: bool, size: tuple[int, 
             limits, bar = [0.0, top], {"above_color": "white"}
     mesh.clear_data()
     mesh.cell_data["shown"] = values
-    plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(size), title=f"{directory}: {title}")
+    plotter: Any = pyvista.Plotter(off_screen=off_screen, window_size=list(size), title=f"{directory}: {title}")
     plotter.set_background("#40444a")
     plotter.add_mesh(
         mesh,

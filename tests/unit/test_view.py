@@ -47,8 +47,8 @@ def solved(*surfaces, camera=None, elements=None, background=0.0):
     return Solved(scene, mesh, mesh.emission + 1.0 * mesh.reflectance)
 
 
-def camera(eye, look_at, fov_deg=60.0, size=32):
-    return Camera(np.asarray(eye, float), np.asarray(look_at, float), np.array([0.0, 0, 1]), fov_deg, size, size)
+def camera(eye, look_at, fov_deg=60.0, size=32, up=(0, 0, 1)):
+    return Camera(np.asarray(eye, float), np.asarray(look_at, float), np.asarray(up, float), fov_deg, size, size)
 
 
 def test_corner_values_keep_creases_and_join_neighbours():
@@ -91,8 +91,8 @@ def test_inside_an_evenly_lit_room_every_pixel_is_alike_and_bright():
 
 def test_faces_are_not_drawn_from_behind():
     plate = Surface.from_polygons("plate", material("grey"), [np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])])
-    front = solved(plate, camera=camera([0.5, 0.5, 1], [0.5, 0.5, 0.01], fov_deg=20))
-    behind = solved(plate, camera=camera([0.5, 0.5, -1], [0.5, 0.5, -0.01], fov_deg=20))
+    front = solved(plate, camera=camera([0.5, 0.5, 1], [0.5, 0.5, 0.01], fov_deg=20, up=[0, 1, 0]))
+    behind = solved(plate, camera=camera([0.5, 0.5, -1], [0.5, 0.5, -0.01], fov_deg=20, up=[0, 1, 0]))
     assert view.render_preview(front).min() == 231
     assert 0 < view.render_preview(behind).max() < 60  # a dark grey background, but not black
 
@@ -133,7 +133,7 @@ def test_other_numbers_of_bands_get_a_colour_bar(bands):
 
 def test_background_light_is_shown():
     plate = Surface.from_polygons("plate", material("grey"), [np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])])
-    away = camera([0.5, 0.5, 1], [0.5, 0.5, 2])
+    away = camera([0.5, 0.5, 1], [0.5, 0.5, 2], up=[0, 1, 0])
     assert view.render_preview(solved(plate, camera=away, background=1.0)).min() == 255
 
 
