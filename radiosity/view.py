@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radiosity.interpolation import corner_values
 from workbench.errors import InputError, MissingLibraryError, OptionError
 from workbench.render.camera import PinholeRays
 from workbench.render.image import write_picture
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 __all__ = [
     "FIELDS",
     "automatic_camera",
-    "corner_values",
     "drawing_problem",
     "render_preview",
     "show",
@@ -60,57 +60,11 @@ INSTALL_EGL = "run 'apt-get install libegl1 libgl1-mesa-dri'"
 PREVIEW_SIDE = 800
 """Longest side of a preview whose size nobody asked for. [pixels]"""
 
-_CREASE = 0.8  # cosine; facets that turn further than this from their mean are not blended
 _BACKGROUND = 0.03  # linear grey behind a scene without background light, so that black stays visible
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 
 
 # ---- the preview ------------------------------------------------------------------------------
-
-
-def corner_values(mesh: PatchMesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values of elements interpolated to the corners of the mesh's pieces.
-
-    Each corner gets the area-weighted mean over the elements of its surface that meet there.  A
-    crease, such as the edge of a box, is kept: across it only elements of one direction are joined.
-
-    Parameters
-    ----------
-    mesh : PatchMesh
-    values : (n, bands) float
-        One row an element.
-
-    Returns
-    -------
-    (k, bands) float
-        One row for each of ``mesh.corners``.
-    """
-    element = np.repeat(mesh.piece_element, np.diff(mesh.piece_start))
-    low = mesh.corners.min(axis=0)
-    size = float(np.ptp(mesh.corners, axis=0).max()) or 1.0
-    place = np.rint((mesh.corners - low) * (1e6 / size)).astype(np.int64)
-    place = np.column_stack([mesh.element_surface[element], mesh.element_side[element], place])
-    vertex = _labels(place)
-    area = mesh.element_area[element]
-    normal = mesh.element_normal[element]
-    mean_normal = _sums(vertex, normal)
-    mean_normal /= np.maximum(np.linalg.norm(mean_normal, axis=1), 1e-300)[:, None]
-    smooth = np.ones(vertex.max() + 1, dtype=bool)
-    smooth[vertex[np.einsum("ij,ij->i", normal, mean_normal[vertex]) < _CREASE]] = False
-    direction = np.where(smooth[vertex][:, None], 0, np.rint(normal * 50)).astype(np.int64)
-    group = _labels(np.column_stack([vertex, direction]))
-    total = _sums(group, values[element] * area[:, None])
-    return (total / _sums(group, area[:, None]))[group]
-
-
-def _labels(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The number (k,) of each row among the distinct rows of a (k, m) array."""
-    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
-
-
-def _sums(group: NDArray[np.int64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums of the rows (k, m) of each group."""
-    return np.column_stack([np.bincount(group, weights=column) for column in rows.T])
 
 
 class _Caster:

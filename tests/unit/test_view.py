@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,32 +48,6 @@ def solved(*surfaces, camera=None, elements=None, background=0.0):
 
 def camera(eye, look_at, fov_deg=60.0, size=32, up=(0, 0, 1)):
     return Camera(np.asarray(eye, float), np.asarray(look_at, float), np.asarray(up, float), fov_deg, size, size)
-
-
-def test_corner_values_keep_creases_and_join_neighbours():
-    room = solved(box("room", [0, 0, 0], [1, 1, 1], inward=True, material=material("grey")), elements=24)
-    mesh = room.mesh
-    # One value a face: a box edge is a crease, so each corner keeps the value of its own face.
-    faces = mesh.element_polygon[:, None].astype(float)
-    corner_element = np.repeat(mesh.piece_element, np.diff(mesh.piece_start))
-    np.testing.assert_allclose(view.corner_values(mesh, faces), faces[corner_element], rtol=1e-14)
-    # A value linear in position: inside a face four elements meet and their mean is exact there.
-    linear = mesh.element_centroid[:, :1] + 2 * mesh.element_centroid[:, 1:2]
-    middle = np.isclose(mesh.corners, 0.5).sum(axis=1) == 2
-    assert middle.sum() == 6 * 4
-    expected = mesh.corners[middle, :1] + 2 * mesh.corners[middle, 1:2]
-    np.testing.assert_allclose(view.corner_values(mesh, linear)[middle], expected, rtol=1e-12)
-
-
-def test_corner_values_join_the_facets_of_a_curved_surface():
-    angle = np.radians(np.arange(0, 181, 10))
-    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    facets = [[[*a, 0], [*b, 0], [*b, 1], [*a, 1]] for a, b in itertools.pairwise(rim)]
-    half = solved(Surface.from_polygons("pipe", material("grey"), [np.array(facet) for facet in facets]))
-    values = view.corner_values(half.mesh, half.mesh.element_centroid[:, :1])
-    top = np.isclose(half.mesh.corners[:, 0], 0, atol=1e-12)  # two facets meet at the crown, mirrored about x = 0
-    assert top.sum() == 4
-    np.testing.assert_allclose(values[top], 0, atol=1e-12)
 
 
 def test_inside_an_evenly_lit_room_every_pixel_is_alike_and_bright():
