@@ -28,7 +28,8 @@ from workbench.geometry.flat import Geometry
 __all__ = ["Objects", "object_crossing", "objects_of", "ray_frame", "ray_limits"]
 
 END_ULPS = 64.0
-"""Crossings within this many units in the last place of a ray's end are rounding of that end."""
+"""Crossings this near a ray's end, in units in the last place of the largest coordinate in the
+scene, are rounding of the end: a point on an edge of the floor does not shadow itself."""
 
 _EDGE_ON = 2.0**-26
 _EPSILON = float(np.finfo(np.float64).eps)
@@ -39,7 +40,8 @@ class Objects(NamedTuple):
 
     ``corners`` (k, 3) and ``piece_start`` (p + 1,) as in :class:`~workbench.geometry.flat.Geometry`;
     ``spheres`` (s, 4) hold centre and radius; ``owner`` (p + s,) is the polygon index to report;
-    ``bounds`` (p + s, 2, 3); ``clear`` (p + s, bands) the transmittances, all zero if opaque.
+    ``bounds`` (p + s, 2, 3); ``clear`` (p + s, bands) the transmittances, all zero if opaque;
+    ``reach`` is the largest coordinate.
     """
 
     corners: NDArray[np.float64]
@@ -48,6 +50,7 @@ class Objects(NamedTuple):
     owner: NDArray[np.int64]
     bounds: NDArray[np.float64]
     clear: NDArray[np.float64]
+    reach: float
 
 
 def objects_of(geometry: Geometry, spheres: ArrayLike | None = None) -> Objects:
@@ -70,15 +73,17 @@ def objects_of(geometry: Geometry, spheres: ArrayLike | None = None) -> Objects:
     if materials:
         by_surface = np.stack([material.transmittance for material in materials])
         clear[: geometry.piece_count] = by_surface[geometry.polygon_surface[geometry.piece_polygon]]
+    bounds = np.concatenate(
+        [geometry.piece_bounds, np.stack([balls[:, :3] - radius, balls[:, :3] + radius], axis=1)]
+    )
     return Objects(
         corners=np.ascontiguousarray(geometry.corners),
         piece_start=np.ascontiguousarray(geometry.piece_start),
         spheres=np.ascontiguousarray(balls),
         owner=np.concatenate([geometry.piece_polygon, geometry.polygon_count + np.arange(len(balls))]),
-        bounds=np.concatenate(
-            [geometry.piece_bounds, np.stack([balls[:, :3] - radius, balls[:, :3] + radius], axis=1)]
-        ),
+        bounds=bounds,
         clear=clear,
+        reach=float(np.abs(bounds).max(initial=0.0)),
     )
 
 
@@ -97,9 +102,9 @@ def ray_frame(directions, ray):
 
 
 @njit(nogil=True, cache=True)
-def ray_limits(origins, directions, ray, far, kz):
+def ray_limits(objects, origins, directions, ray, far, kz):
     """The open interval of t that counts: END_ULPS of the coordinates inside both ends."""
-    start = end = 0.0
+    start = end = objects.reach
     for k in range(3):
         start = max(start, abs(origins[ray, k]))
         end = max(end, abs(origins[ray, k] + far * directions[ray, k])) if far < math.inf else 0.0

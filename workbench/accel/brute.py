@@ -21,7 +21,7 @@ def _trace(objects, origins, directions, far, skip, any_hit, t, polygon, counts)
     pieces = objects.piece_start.shape[0] - 1
     for ray in range(origins.shape[0]):
         frame = ray_frame(directions, ray)
-        near, limit = ray_limits(origins, directions, ray, far[ray], frame[2])
+        near, limit = ray_limits(objects, origins, directions, ray, far[ray], frame[2])
         t[ray] = math.inf
         polygon[ray] = NO_POLYGON
         for index in range(objects.owner.shape[0]):
@@ -45,7 +45,7 @@ def _transmit(objects, origins, directions, far, skip, through, counts):
     bands = through.shape[1]
     for ray in range(origins.shape[0]):
         frame = ray_frame(directions, ray)
-        near, limit = ray_limits(origins, directions, ray, far[ray], frame[2])
+        near, limit = ray_limits(objects, origins, directions, ray, far[ray], frame[2])
         through[ray] = 1.0
         met = False
         for index in range(objects.owner.shape[0]):

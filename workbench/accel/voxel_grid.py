@@ -187,7 +187,7 @@ def walk(
     tells a test avoided from a second meeting with the same ray.
     """
     frame = ray_frame(directions, ray)
-    near, limit = ray_limits(origins, directions, ray, far, frame[2])
+    near, limit = ray_limits(objects, origins, directions, ray, far, frame[2])
     pieces = objects.piece_start.shape[0] - 1
     counts[_RAYS] += 1
     best, best_index = math.inf, -1
