@@ -141,6 +141,8 @@ def solve(
     start = time.perf_counter()
     loaded = workbench.load(scene)
     seconds_reading = time.perf_counter() - start
+    for note in loaded.notes:
+        click.echo(f"note: {note}", err=True)
     if loaded.camera is not None and not no_preview:
         from workbench.render.camera import PinholeRays
 
@@ -182,8 +184,11 @@ def _save(solution: Solution, directory: Path, *, preview: bool, json_path: str 
             "up": list(map(float, camera.up)),
             "fov_deg": float(camera.fov_deg),
         }
-    with record.stage("save"):
-        solution.save(directory)
+    try:
+        with record.stage("save"):
+            solution.save(directory)
+    except OSError as error:
+        raise InputError(f"{directory}: the solution cannot be written: {error.strerror or error}") from None
     if preview:
         from radiosity.view import write_preview
 
@@ -300,6 +305,15 @@ def _share_done(first: float | None, residual: float, tolerance: float) -> float
     return math.log(first / residual) / math.log(first / tolerance)
 
 
+_ERRORS = {
+    "remaining_bound": "light still missing, at most this share",
+    "energy_imbalance": "energy book off by",
+    "row_sum": "row sums of form factors",
+    "reciprocity": "reciprocity error",
+}
+"""How the summary calls the error estimates of a record."""
+
+
 def _summary(solution: Solution, files: list[Path]) -> str:
     """The end of a solve in a few lines."""
     record = solution.record
@@ -310,7 +324,7 @@ def _summary(solution: Solution, files: list[Path]) -> str:
         f"{record.counters['shots']} shots, {record.counters['rays']} rays"
     ]
     lines.append("seconds: " + ", ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()))
-    lines += [f"{name.replace('_', ' ')}: {_short(value)}" for name, value in record.errors.items()]
+    lines += [f"{_ERRORS.get(name, name.replace('_', ' '))}: {_short(value)}" for name, value in record.errors.items()]
     lines += [f"{path}" for path in files]
     return "\n".join(lines)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Check", "examine", "free_memory"]
+__all__ = ["Check", "examine"]
 
 _INSTALL = "run 'pip install -c constraints.txt .' in the project's folder"
 
@@ -38,17 +38,6 @@ class Check:
     found: str
     advice: str = ""
     essential: bool = True
-
-
-def free_memory() -> int | None:
-    """Bytes of memory free for use (``MemAvailable``), or ``None`` where the system does not say."""
-    try:
-        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    except (OSError, ValueError):
-        pass
-    return None
 
 
 def _python() -> Check:
@@ -93,9 +82,9 @@ def _threads() -> Check:
 
 
 def _memory() -> Check:
-    free = free_memory()
-    if free is None:
-        return Check("memory", True, "free memory unknown on this system", essential=False)
+    from workbench.memory import available_bytes
+
+    free = available_bytes()
     good = free >= 1 << 30
     advice = "" if good else "close other programs: less than 1 GiB is free"
     return Check("memory", good, f"{free / (1 << 30):.1f} GiB free", advice, essential=False)
