@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from radiosity.patches import PatchMesh
-    from radiosity.solvers.solution import ProgressEvent, Solution, solve
+    from radiosity.solvers.solution import ProgressEvent, Solution
+    from radiosity.solvers.solve import solve
     from radiosity.view import render_preview
 
 __all__ = ["PatchMesh", "ProgressEvent", "Solution", "render_preview", "solve"]
@@ -25,7 +26,7 @@ _HOME = {
     "ProgressEvent": "radiosity.solvers.solution",
     "Solution": "radiosity.solvers.solution",
     "render_preview": "radiosity.view",
-    "solve": "radiosity.solvers.solution",
+    "solve": "radiosity.solvers.solve",
 }
 
 

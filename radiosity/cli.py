@@ -111,7 +111,7 @@ def main() -> None:
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Threads.  [default: all cores]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of the rays.")
 @click.option("--json", "json_path", metavar="FILE", help="Write the run's record here too; - is standard output.")
-@click.option("--resume", is_flag=True, help="Go on from the solution in DIR.")
+@click.option("--resume", is_flag=True, help="Go on from the solution in DIR, with its options unless given anew.")
 @click.option("--no-preview", is_flag=True, help="Draw no picture.")
 def solve(
     scene: str,
@@ -150,20 +150,20 @@ def solve(
     with _writable(directory, None if json_path in (None, "-") else Path(str(json_path))):
         import radiosity
 
-        previous = radiosity.Solution.load(directory) if resume else None
+        options: dict[str, Any] = {
+            "method": method,
+            "elements": elements,
+            "max_edge": max_edge,
+            "rays": rays,
+            "tolerance": tolerance,
+            "seed": seed,
+        }
+        previous = None
+        if resume:
+            previous = radiosity.Solution.load(directory)
+            options |= _asked_before(previous.record.settings, options)
         with _progress() as report:
-            solution = radiosity.solve(
-                loaded,
-                method=method,
-                elements=elements,
-                max_edge=max_edge,
-                rays=rays,
-                tolerance=tolerance,
-                workers=workers,
-                seed=seed,
-                progress=report,
-                resume=previous,
-            )
+            solution = radiosity.solve(loaded, workers=workers, progress=report, resume=previous, **options)
         solution.record.seconds["read scene"] = seconds_reading
         _save(solution, directory, preview=not no_preview, json_path=json_path)
     names = ["solution.vtp", "solution.npz", "record.json"] + ([] if no_preview else ["preview.png"])
@@ -171,6 +171,15 @@ def solve(
     if solution.stopped == "interrupted":
         _complain(f"stopped by Ctrl-C; go on with: radiosity solve {scene} -o {directory} --resume")
         raise SystemExit(INTERRUPTED)
+
+
+def _asked_before(settings: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """The options of the earlier run that this command line leaves open."""
+    context = click.get_current_context()
+    given = {name for name in options if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE}
+    if given & {"elements", "max_edge"}:  # one of the two stands for both
+        given |= {"elements", "max_edge"}
+    return {name: settings[name] for name in options if name not in given and name in settings}
 
 
 def _save(solution: Solution, directory: Path, *, preview: bool, json_path: str | None) -> None:
