@@ -164,7 +164,7 @@ def solve(
             options |= _asked_before(previous.record.settings, options)
         with _progress() as report:
             solution = radiosity.solve(loaded, workers=workers, progress=report, resume=previous, **options)
-        solution.record.seconds["read scene"] = seconds_reading
+        solution.record.seconds = {"read scene": seconds_reading} | solution.record.seconds
         _save(solution, directory, preview=not no_preview, json_path=json_path)
     names = ["solution.vtp", "solution.npz", "record.json"] + ([] if no_preview else ["preview.png"])
     click.echo(_summary(solution, [directory / name for name in names]), err=json_path == "-")
@@ -332,7 +332,7 @@ def _summary(solution: Solution, files: list[Path]) -> str:
         f"{solution.scene.name}: {state}; {len(solution.mesh.element_area)} elements, {patches} patches, "
         f"{record.counters['shots']} shots, {record.counters['rays']} rays"
     ]
-    lines.append("seconds: " + ", ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()))
+    lines.append("seconds: " + "; ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()))
     lines += [f"{_ERRORS.get(name, name.replace('_', ' '))}: {_short(value)}" for name, value in record.errors.items()]
     lines += [f"{path}" for path in files]
     return "\n".join(lines)
@@ -374,7 +374,12 @@ def scenes() -> None:
     """List the built-in scenes, which 'solve' takes by name."""
     from workbench.scene.load import built_in_scenes
 
-    for name, about in built_in_scenes().items():
+    listed = built_in_scenes()
+    if not listed:
+        raise InputError(
+            "found no built-in scenes; they lie in the folder scenes/ of the project's clone: run from there"
+        )
+    for name, about in listed.items():
         click.echo(f"{name:24s} {about}")
 
 
