@@ -10,6 +10,7 @@ from workbench.geometry.splines import (
     RationalSurface,
     clamped_knots,
     evaluate,
+    facet_error,
     surface_of_revolution,
     tessellate,
     torus,
@@ -148,3 +149,17 @@ def test_a_surface_without_area_is_refused():
         tessellate(flat, 2, 2)
     with pytest.raises(InputError, match="tube"):
         torus(1.0, 1.5)
+
+
+def test_facet_error_is_the_sagitta_and_falls_by_the_square():
+    # A cylinder of radius 2: the error is the sagitta of its chords, r (1 - cos(pi / n)), to the
+    # extent that the rational circle's parameter is uneven inside each quarter.
+    cylinder = surface_of_revolution([[2.0, 0.0], [2.0, 1.0]], degree=1)
+    errors = [facet_error(cylinder, count, 1) for count in (16, 32, 64)]
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(4, rel=0.05)
+    vertices, _, _ = tessellate(cylinder, 64, 1)
+    rim = vertices[np.isclose(vertices[:, 2], 0)]
+    turn = np.sort(np.arctan2(rim[:, 1], rim[:, 0]))
+    longest = np.diff(np.append(turn, turn[0] + 2 * np.pi)).max()
+    assert errors[2] == pytest.approx(2.0 * (1 - np.cos(longest / 2)), rel=0.02)

@@ -225,6 +225,7 @@ class Scene:
 
     ``closed`` says that the author declares the surfaces an enclosure: no light escapes, every
     row of form factors sums to 1.  ``background`` is the radiance seen where no surface is.
+    ``notes`` tell, a sentence each, what the reader changed or supposed.
     """
 
     name: str
@@ -235,6 +236,7 @@ class Scene:
     bands: int = 3
     closed: bool = False
     path: Path | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def has_emitter(self) -> bool:
