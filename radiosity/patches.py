@@ -302,6 +302,7 @@ def build_mesh(
     elements: int | None = None,
     max_edge: float | None = None,
     split: int = 2,
+    cluster: bool = True,
 ) -> PatchMesh:
     """Divide a scene's polygons into elements and patches.
 
@@ -315,6 +316,8 @@ def build_mesh(
         Longest element edge instead. [scene lengths]  Neither: one element a polygon.
     split : int
         Elements along the edge of a patch.
+    cluster : bool
+        Let small facets of tessellated surfaces shoot together.
 
     Raises
     ------
@@ -347,7 +350,7 @@ def build_mesh(
         sizes = np.diff(surface.ring_offsets)
         fine: set[int] = set()
         # Small facets of a tessellated surface shoot together, as clusters.
-        if surface.face_count >= 64 and len(sizes) == surface.face_count:
+        if cluster and surface.face_count >= 64 and len(sizes) == surface.face_count:
             corner = surface.vertices[surface.ring_vertices]
             starts = surface.ring_offsets[:-1]
             extent = np.maximum.reduceat(corner, starts) - np.minimum.reduceat(corner, starts)
@@ -358,11 +361,11 @@ def build_mesh(
                 # Large enough that a cluster gathers a dozen facets, small against the surface.
                 cell = max(min(edge, math.sqrt(area / 24)), math.sqrt(12 * area / len(small)))
                 centroid = np.add.reduceat(corner, starts)[small] / sizes[small, None]
-                cluster = _clusters(centroid, geometry.polygon_normal[number + small], cell)
+                group_of = _clusters(centroid, geometry.polygon_normal[number + small], cell)
                 for sign in sides:
                     base = len(senders)
-                    groups: list[list[FloatArray]] = [[] for _ in range(int(cluster.max()) + 1)]
-                    for face, group in zip(small.tolist(), cluster.tolist(), strict=True):
+                    groups: list[list[FloatArray]] = [[] for _ in range(int(group_of.max()) + 1)]
+                    for face, group in zip(small.tolist(), group_of.tolist(), strict=True):
                         ring = surface.face(face)[0][::sign]
                         rings.append([ring])
                         polygon.append(number + face)

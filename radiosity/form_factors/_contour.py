@@ -173,9 +173,7 @@ def contour_integral(p, np_, q, nq, tolerance):
             while top >= 0:
                 lo, hi, depth = stack[top, 0], stack[top, 1], stack[top, 2]
                 top -= 1
-                kronrod, gauss = _kronrod(
-                    lo, hi, bx, by, bz, gx, gy, gz, ax, ay, az, ux, uy, uz, length, log_r0
-                )
+                kronrod, gauss = _kronrod(lo, hi, bx, by, bz, gx, gy, gz, ax, ay, az, ux, uy, uz, length, log_r0)
                 difference = abs(kronrod - gauss)
                 # The rule's rounding noise bounds what halving can still gain.
                 floor = 4e-16 * length * (hi - lo)

@@ -50,9 +50,7 @@ def _point_to_piece(points, normals, piece, nx, ny, nz, reach, out):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         height = (x - piece[0, 0]) * nx + (y - piece[0, 1]) * ny + (z - piece[0, 2]) * nz
         if height > 1e-15 * reach:
-            share = lambert_piece(
-                x, y, z, normals[i, 0], normals[i, 1], normals[i, 2], piece, 0, piece.shape[0]
-            )
+            share = lambert_piece(x, y, z, normals[i, 0], normals[i, 1], normals[i, 2], piece, 0, piece.shape[0])
             out[i] += max(share, 0.0)
 
 

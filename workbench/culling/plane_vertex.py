@@ -21,14 +21,14 @@ CHECK_SLACK = 1e-12
 
 
 @njit(nogil=True, cache=True)
-def light_pyramid(x, y, z, nx, ny, nz, sender, s0, s1, sender_normal, slack, planes):
+def light_pyramid(x, y, z, nx, ny, nz, sender, s0, s1, sender_normal, inset, planes):
     """Planes of the pyramid from (x, y, z) to the convex sender ``sender[s0:s1]``.
 
     Rows (nx, ny, nz, d) of ``planes`` hold unit normals pointing inward, ``n . x >= d`` inside: one
     a sender's edge, the receiver's tangent plane and the sender's plane.  A degenerate plane (the
-    edge seen end on) is left out.  The last two are set inward by ``2 slack``: a polygon that lies in
-    the tangent plane or in the sender's plane blocks nothing, and a check that leaves out only what
-    is outside by ``slack`` shall still drop it.  Returns the number of planes.
+    edge seen end on) is left out.  With ``inset`` above zero every plane moves inward by it, which
+    drops polygons that only touch the pyramid from outside: right for irradiance (they hide a null
+    set), wrong for single rays along an edge.  Returns the number of planes.
     """
     cx = cy = cz = 0.0
     count = s1 - s0
@@ -54,14 +54,14 @@ def light_pyramid(x, y, z, nx, ny, nz, sender, s0, s1, sender_normal, slack, pla
             length = -length
         px, py, pz = px / length, py / length, pz / length
         planes[used, 0], planes[used, 1], planes[used, 2] = px, py, pz
-        planes[used, 3] = px * x + py * y + pz * z
+        planes[used, 3] = px * x + py * y + pz * z + inset
         used += 1
     planes[used, 0], planes[used, 1], planes[used, 2] = nx, ny, nz
-    planes[used, 3] = nx * x + ny * y + nz * z + 2.0 * slack
+    planes[used, 3] = nx * x + ny * y + nz * z + inset
     used += 1
     mx, my, mz = sender_normal[0], sender_normal[1], sender_normal[2]
     planes[used, 0], planes[used, 1], planes[used, 2] = mx, my, mz
-    planes[used, 3] = mx * sender[s0, 0] + my * sender[s0, 1] + mz * sender[s0, 2] + 2.0 * slack
+    planes[used, 3] = mx * sender[s0, 0] + my * sender[s0, 1] + mz * sender[s0, 2] + inset
     return used + 1
 
 

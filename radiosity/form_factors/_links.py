@@ -1,0 +1,621 @@
+"""Form factors from elements to one patch, as kernels: settle, cut, or leave to rays.
+
+For each group of receivers (the elements of one patch): facing and horizon, then a shaft to the
+sender whose surviving candidates go down to the elements, then at each point the light pyramid.
+No candidate left: closed form.  A few: the sender is cut exactly.  Many: the element is flagged
+and rays scale its closed form (:mod:`radiosity.form_factors.bundle`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from radiosity.form_factors.analytic import pair_exchange
+from radiosity.patches import PatchMesh
+from workbench.accel.box_tree import BoxTree, boxes_meeting_planes
+from workbench.culling.plane_vertex import CHECK_SLACK, light_pyramid, outside_planes
+from workbench.culling.shaft import MAX_SHAFT_PLANES, box_shaft
+from workbench.geometry.flat import Geometry
+from workbench.geometry.lambert import lambert_piece
+from workbench.shadow.area import MAX_CORNERS, MAX_PIECES, visible_share
+
+MAX_CANDIDATES = 192
+"""Longest candidate list handed down to a group; beyond it each point asks the tree itself."""
+
+# Rows of the tally that kernels fill; names of workbench.counters.
+TALLY = (
+    "box_tests",
+    "shafts",
+    "shafts_empty",
+    "shaft_tests",
+    "shaft_culls",
+    "horizon_culls",
+    "plane_vertex_checks",
+    "plane_vertex_culls",
+    "not_inshadow",
+    "inshadow",
+    "complex_shadow",
+    "closed_forms",
+    "exact_cuts",
+    "exact_pieces",
+    "exact_overflows",
+    "links",
+)
+(
+    _BOX,
+    _SHAFT,
+    _EMPTY,
+    _STEST,
+    _SCULL,
+    _HORIZON,
+    _CHECK,
+    _CULL,
+    _CLEAR,
+    _DARK,
+    _COMPLEX,
+    _CLOSED,
+    _CUT,
+    _PIECES,
+    _OVERFLOW,
+    _LINK,
+) = range(len(TALLY))
+
+NEEDS_RAYS = -1.0
+
+_GAUSS = 0.5 / math.sqrt(3.0)
+
+
+class OccluderArrays(NamedTuple):
+    """What the kernels read of a geometry and its box tree."""
+
+    corners: np.ndarray
+    piece_start: np.ndarray
+    piece_polygon: np.ndarray
+    bounds: np.ndarray
+    through: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    skip: np.ndarray
+    first: np.ndarray
+    count: np.ndarray
+    order: np.ndarray
+    slack: float
+
+
+class MeshArrays(NamedTuple):
+    """What the kernels read of a patch mesh."""
+
+    corners: np.ndarray
+    piece_start: np.ndarray
+    element_piece: np.ndarray
+    normal: np.ndarray
+    area: np.ndarray
+    centroid: np.ndarray
+    size: np.ndarray
+    polygon: np.ndarray
+    patch_start: np.ndarray
+    sender_corners: np.ndarray
+    sender_start: np.ndarray
+    sender_normal: np.ndarray
+    patch_sender: np.ndarray
+    patch_polygon: np.ndarray
+    patch_bounds: np.ndarray
+    patch_normal: np.ndarray
+
+
+class Workspace(NamedTuple):
+    """Scratch of one thread."""
+
+    planes: np.ndarray
+    shaft: np.ndarray
+    found: np.ndarray
+    picked: np.ndarray
+    boxes: np.ndarray
+    sizes: np.ndarray
+    weights: np.ndarray
+    cut: np.ndarray
+    pair: np.ndarray
+    cells: np.ndarray
+    points: np.ndarray
+    state: np.ndarray
+
+
+def occluder_arrays(geometry: Geometry, tree: BoxTree) -> OccluderArrays:
+    """Gather the arrays of a geometry for the kernels."""
+    return OccluderArrays(
+        geometry.corners,
+        geometry.piece_start,
+        geometry.piece_polygon,
+        geometry.piece_bounds,
+        np.ascontiguousarray(geometry.polygon_transmittance[geometry.piece_polygon]),
+        tree.low,
+        tree.high,
+        tree.skip,
+        tree.first,
+        tree.count,
+        tree.order,
+        CHECK_SLACK * geometry.size,
+    )
+
+
+def mesh_arrays(mesh: PatchMesh) -> MeshArrays:
+    """Gather the arrays of a mesh for the kernels."""
+    return MeshArrays(
+        mesh.corners,
+        mesh.piece_start,
+        mesh.element_piece,
+        mesh.element_normal,
+        mesh.element_area,
+        mesh.element_centroid,
+        mesh.element_size,
+        mesh.element_polygon,
+        mesh.patch_start,
+        mesh.sender_corners,
+        mesh.sender_start,
+        mesh.sender_normal,
+        mesh.patch_sender,
+        mesh.patch_polygon,
+        mesh.patch_bounds,
+        mesh.patch_normal,
+    )
+
+
+def workspace(max_corners: int) -> Workspace:
+    """Scratch arrays for one thread; ``max_corners`` is the longest sender or element ring."""
+    room = max(MAX_CORNERS, 2 * max_corners + 4)
+    return Workspace(
+        planes=np.empty((room + 2, 4)),
+        shaft=np.empty((MAX_SHAFT_PLANES, 4)),
+        found=np.empty(MAX_CANDIDATES, dtype=np.int64),
+        picked=np.empty(MAX_CANDIDATES, dtype=np.int64),
+        boxes=np.empty((2, MAX_PIECES, MAX_CORNERS, 3)),
+        sizes=np.zeros((2, MAX_PIECES), dtype=np.int64),
+        weights=np.empty((2, MAX_PIECES)),
+        cut=np.empty((4, MAX_CORNERS, 3)),
+        pair=np.empty((4, room, 3)),
+        cells=np.empty((80, 4, 3)),
+        points=np.empty((4, 4)),
+        state=np.empty((80, 4)),
+    )
+
+
+@njit(nogil=True, cache=True)
+def _open_share(x, y, z, nx, ny, nz, corners, s0, s1, normals, s, slack):
+    """Lambert's formula for one sender piece; 0 from behind or in its plane."""
+    mx, my, mz = normals[s, 0], normals[s, 1], normals[s, 2]
+    height = mx * (x - corners[s0, 0]) + my * (y - corners[s0, 1]) + mz * (z - corners[s0, 2])
+    if height <= 1e-3 * slack:
+        return 0.0
+    return lambert_piece(x, y, z, nx, ny, nz, corners, s0, s1)
+
+
+@njit(nogil=True, cache=True)
+def _pick(candidates, many, own, other, piece_polygon, corners, starts, planes, used, slack, limit, picked, tally):
+    """Candidates that cross the pyramid, at most ``limit + 1``; own polygons are out by identity."""
+    kept = 0
+    for c in range(many):
+        piece = candidates[c]
+        if piece_polygon[piece] == own or piece_polygon[piece] == other:
+            continue
+        tally[_CHECK] += 1
+        if outside_planes(corners, starts[piece], starts[piece + 1], planes, used, slack):
+            tally[_CULL] += 1
+            continue
+        picked[kept] = piece
+        kept += 1
+        if kept > limit:
+            break
+    return kept
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _point_share(x, y, z, nx, ny, nz, own, geo, mesh, patch, found, count, limit, work, tally):
+    """Form factor from a point to a patch; ``NEEDS_RAYS`` if more than ``limit`` candidates remain.
+
+    ``found[:count]`` are the group's candidates; a negative count sends the query to the tree.
+    Inlined: a call that hands on these tuples of arrays costs more than the work it does.
+    """
+    total = 0.0
+    other = mesh.patch_polygon[patch]
+    for s in range(mesh.patch_sender[patch], mesh.patch_sender[patch + 1]):
+        s0, s1 = mesh.sender_start[s], mesh.sender_start[s + 1]
+        share = _open_share(x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, mesh.sender_normal, s, geo.slack)
+        if share <= 0.0:
+            continue
+        tally[_CLOSED] += 1
+        normal = mesh.sender_normal[s]
+        used = light_pyramid(
+            x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, normal, 2.0 * geo.slack, work.planes
+        )
+        candidates, many = found, count
+        if count < 0:
+            candidates = work.picked
+            many = boxes_meeting_planes(
+                geo.low, geo.high, geo.skip, geo.first, geo.count, geo.order, geo.bounds,
+                work.planes, used, geo.slack, work.picked, tally,
+            )  # fmt: skip
+        kept = MAX_CANDIDATES + 1
+        if many <= MAX_CANDIDATES:
+            kept = _pick(
+                candidates, many, own, other, geo.piece_polygon, geo.corners, geo.piece_start, work.planes, used,
+                geo.slack, limit, work.picked, tally,
+            )  # fmt: skip
+        if kept == 0:
+            tally[_CLEAR] += 1
+            total += share
+            continue
+        pieces = -1
+        visible = 0.0
+        if kept <= limit:
+            visible, pieces = visible_share(
+                x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, normal, geo.corners, geo.piece_start,
+                geo.through, work.picked, kept, work.boxes, work.sizes, work.weights, work.cut,
+            )  # fmt: skip
+            tally[_CUT] += 1
+            if pieces < 0:
+                tally[_OVERFLOW] += 1
+        if pieces < 0:
+            tally[_COMPLEX] += 1
+            total = NEEDS_RAYS
+            break
+        tally[_PIECES] += pieces
+        if pieces == 0:
+            tally[_DARK] += 1
+        total += min(visible, share)
+    return total
+
+
+@njit(nogil=True, cache=True)
+def _cell_points(cell, quad, out):
+    """Rows (x, y, z, weight) of a quad's 2 x 2 Gauss rule or a triangle's 3-point rule; their number."""
+    if quad:
+        for k in range(4):
+            u = 0.5 + (_GAUSS if k & 1 else -_GAUSS)
+            v = 0.5 + (_GAUSS if k & 2 else -_GAUSS)
+            w0, w1, w2, w3 = (1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v
+            for axis in range(3):
+                out[k, axis] = w0 * cell[0, axis] + w1 * cell[1, axis] + w2 * cell[2, axis] + w3 * cell[3, axis]
+            ax = (1 - v) * (cell[1, 0] - cell[0, 0]) + v * (cell[2, 0] - cell[3, 0])
+            ay = (1 - v) * (cell[1, 1] - cell[0, 1]) + v * (cell[2, 1] - cell[3, 1])
+            az = (1 - v) * (cell[1, 2] - cell[0, 2]) + v * (cell[2, 2] - cell[3, 2])
+            bx = (1 - u) * (cell[3, 0] - cell[0, 0]) + u * (cell[2, 0] - cell[1, 0])
+            by = (1 - u) * (cell[3, 1] - cell[0, 1]) + u * (cell[2, 1] - cell[1, 1])
+            bz = (1 - u) * (cell[3, 2] - cell[0, 2]) + u * (cell[2, 2] - cell[1, 2])
+            jx, jy, jz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            out[k, 3] = 0.25 * math.sqrt(jx * jx + jy * jy + jz * jz)
+        return 4
+    ax, ay, az = cell[1, 0] - cell[0, 0], cell[1, 1] - cell[0, 1], cell[1, 2] - cell[0, 2]
+    bx, by, bz = cell[2, 0] - cell[0, 0], cell[2, 1] - cell[0, 1], cell[2, 2] - cell[0, 2]
+    jx, jy, jz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    area = 0.5 * math.sqrt(jx * jx + jy * jy + jz * jz)
+    for k in range(3):
+        u = 2.0 / 3.0 if k == 1 else 1.0 / 6.0
+        v = 2.0 / 3.0 if k == 2 else 1.0 / 6.0
+        out[k, 0] = cell[0, 0] + u * ax + v * bx
+        out[k, 1] = cell[0, 1] + u * ay + v * by
+        out[k, 2] = cell[0, 2] + u * az + v * bz
+        out[k, 3] = area / 3.0
+    return 3
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _cell_integral(cell, quad, nx, ny, nz, own, geo, mesh, patch, found, count, limit, work, tally):
+    """Integral of the point form factor over a cell; ``NEEDS_RAYS`` if a point needs them."""
+    total = 0.0
+    for k in range(_cell_points(cell, quad, work.points)):
+        share = _point_share(
+            work.points[k, 0], work.points[k, 1], work.points[k, 2], nx, ny, nz, own, geo, mesh, patch, found,
+            count, limit, work, tally,
+        )  # fmt: skip
+        if share < 0.0:
+            total = NEEDS_RAYS
+            break
+        total += work.points[k, 3] * share
+    return total
+
+
+@njit(nogil=True, cache=True)
+def _child(cell, quad, k, out):
+    """Quarter ``k`` of a cell."""
+    if quad:
+        for axis in range(3):
+            a, b, c, d = cell[0, axis], cell[1, axis], cell[2, axis], cell[3, axis]
+            ab, bc, cd, da = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + d), 0.5 * (d + a)
+            m = 0.25 * (a + b + c + d)
+            if k == 0:
+                out[0, axis], out[1, axis], out[2, axis], out[3, axis] = a, ab, m, da
+            elif k == 1:
+                out[0, axis], out[1, axis], out[2, axis], out[3, axis] = ab, b, bc, m
+            elif k == 2:
+                out[0, axis], out[1, axis], out[2, axis], out[3, axis] = m, bc, c, cd
+            else:
+                out[0, axis], out[1, axis], out[2, axis], out[3, axis] = da, m, cd, d
+        return
+    for axis in range(3):
+        a, b, c = cell[0, axis], cell[1, axis], cell[2, axis]
+        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        if k == 0:
+            out[0, axis], out[1, axis], out[2, axis] = a, ab, ca
+        elif k == 1:
+            out[0, axis], out[1, axis], out[2, axis] = ab, b, bc
+        elif k == 2:
+            out[0, axis], out[1, axis], out[2, axis] = ca, bc, c
+        else:
+            out[0, axis], out[1, axis], out[2, axis] = ab, bc, ca
+
+
+@njit(nogil=True, cache=True)
+def _first_cell(corners, a, b, k, out):
+    """Cell ``k`` of a convex ring: the quad itself, or triangle ``k`` of its fan."""
+    if b - a == 4:
+        for i in range(4):
+            for axis in range(3):
+                out[i, axis] = corners[a + i, axis]
+        return True
+    for axis in range(3):
+        out[0, axis] = corners[a, axis]
+        out[1, axis] = corners[a + k + 1, axis]
+        out[2, axis] = corners[a + k + 2, axis]
+        out[3, axis] = corners[a, axis]
+    return False
+
+
+@njit(nogil=True, cache=True)
+def element_integral(
+    element, patch, geo, mesh, found, count, limit, tolerance, levels, own, work, tally
+):  # fmt: skip
+    """Integral of the point form factor over an element, halving cells until ``tolerance`` is met.
+
+    ``tolerance`` is absolute, on the integral; ``levels`` bounds the halvings.  Each cell is
+    compared with its four quarters.  Returns (integral, error estimate); the integral is
+    ``NEEDS_RAYS`` if some point has too many candidates.
+    """
+    nx, ny, nz = mesh.normal[element, 0], mesh.normal[element, 1], mesh.normal[element, 2]
+    total = error = 0.0
+    cells, state = work.cells, work.state
+    for piece in range(mesh.element_piece[element], mesh.element_piece[element + 1]):
+        a, b = mesh.piece_start[piece], mesh.piece_start[piece + 1]
+        fans = 1 if b - a == 4 else b - a - 2
+        for k in range(fans):
+            quad = _first_cell(mesh.corners, a, b, k, cells[0])
+            value = _cell_integral(cells[0], quad, nx, ny, nz, own, geo, mesh, patch, found, count, limit, work, tally)
+            if value < 0.0:
+                return NEEDS_RAYS, 0.0
+            if levels == 0:
+                total += value
+                continue
+            # Row of state: value, tolerance, level.
+            state[0, 0], state[0, 1], state[0, 2] = value, tolerance / fans, 0.0
+            top = 0
+            while top >= 0:
+                value, allowed, level = state[top, 0], state[top, 1], state[top, 2]
+                # The cell's own row becomes its last quarter, so quarters are made from a copy.
+                parent = cells[79]
+                for i in range(4):
+                    for axis in range(3):
+                        parent[i, axis] = cells[top, i, axis]
+                quarters = 0.0
+                for q in range(4):
+                    _child(parent, quad, q, cells[top + q])
+                    part = _cell_integral(
+                        cells[top + q], quad, nx, ny, nz, own, geo, mesh, patch, found, count, limit, work, tally
+                    )
+                    if part < 0.0:
+                        return NEEDS_RAYS, 0.0
+                    state[top + q, 0] = part
+                    quarters += part
+                difference = abs(quarters - value)
+                if difference <= 4.0 * allowed or level + 1.0 >= levels:
+                    total += quarters
+                    error += 0.25 * difference
+                    top -= 1
+                else:
+                    for q in range(4):
+                        state[top + q, 1], state[top + q, 2] = 0.5 * allowed, level + 1.0
+                    top += 3
+    return total, error
+
+
+@njit(nogil=True, cache=True)
+def _clear_rule(
+    corners, starts, p0, p1, normals, element, sender_corners, sender_start, sender_normal, t0, t1, slack, levels,
+    cells, points,
+):  # fmt: skip
+    """Integral over an element of the unoccluded form factor to sender pieces ``t0..t1``.
+
+    One rule a cell, on the whole element (``levels`` 0) or on its quarters (1).
+    """
+    nx, ny, nz = normals[element, 0], normals[element, 1], normals[element, 2]
+    total = 0.0
+    for piece in range(p0, p1):
+        a, b = starts[piece], starts[piece + 1]
+        for k in range(1 if b - a == 4 else b - a - 2):
+            quad = _first_cell(corners, a, b, k, cells[0])
+            for q in range(4 if levels else 1):
+                if levels:
+                    _child(cells[0], quad, q, cells[1])
+                for i in range(_cell_points(cells[levels], quad, points)):
+                    x, y, z = points[i, 0], points[i, 1], points[i, 2]
+                    for s in range(t0, t1):
+                        total += points[i, 3] * max(
+                            _open_share(
+                                x, y, z, nx, ny, nz, sender_corners, sender_start[s], sender_start[s + 1],
+                                sender_normal, s, slack,
+                            ),
+                            0.0,
+                        )  # fmt: skip
+    return total
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _clear_factor(element, patch, gap, geo, mesh, error, floor, exact, exact_wanted, work, tally):
+    """Unoccluded form factor from an element to a patch, and the estimate of its error.
+
+    Far pairs: the element's 2 x 2 rule, whose error falls with the fourth power of size over
+    distance; nearer: 4 x 4; near and touching pairs: the closed form.  ``exact`` says that the
+    closed form may be used (the patch is one polygon or nothing stands between), ``exact_wanted`` that
+    it must be.
+    """
+    area, size = mesh.area[element], mesh.size[element]
+    reach = (0.05 / error) ** 0.25 * size
+    value = doubt = 0.0
+    tally[_CLOSED] += 1
+    closed = exact and (exact_wanted or gap < 0.5 * reach)
+    if not (exact and exact_wanted):
+        levels = 0 if closed or gap >= reach else 1
+        value = _clear_rule(
+            mesh.corners, mesh.piece_start, mesh.element_piece[element], mesh.element_piece[element + 1], mesh.normal,
+            element, mesh.sender_corners, mesh.sender_start, mesh.sender_normal, mesh.patch_sender[patch],
+            mesh.patch_sender[patch + 1], geo.slack, levels, work.cells, work.points,
+        )  # fmt: skip
+        ratio = size / max(gap, 1e-3 * size) / (1.0 + levels)
+        doubt = value * min(0.05 * ratio * ratio * ratio * ratio, 1.0)
+    if closed:
+        tolerance = 0.1 * (error * value + floor * area) + 1e-15 * area
+        value = doubt = 0.0
+        for piece in range(mesh.element_piece[element], mesh.element_piece[element + 1]):
+            for s in range(mesh.patch_sender[patch], mesh.patch_sender[patch + 1]):
+                value += pair_exchange(
+                    mesh.corners, mesh.piece_start[piece], mesh.piece_start[piece + 1], mesh.normal[element],
+                    mesh.sender_corners, mesh.sender_start[s], mesh.sender_start[s + 1], mesh.sender_normal[s],
+                    tolerance, work.pair,
+                )  # fmt: skip
+    return value / area, doubt / area
+
+
+@njit(nogil=True, cache=True)
+def _box_distance(centroid, element, bounds, patch):
+    """Distance from an element's centroid to the box round a patch."""
+    square = 0.0
+    for axis in range(3):
+        value = centroid[element, axis]
+        low, high = bounds[patch, 0, axis], bounds[patch, 1, axis]
+        off = max(low - value, 0.0, value - high)
+        square += off * off
+    return math.sqrt(square)
+
+
+@njit(nogil=True, cache=True)
+def _group_faces(q, patch, mesh, slack):
+    """Whether a flat group and a flat patch have points in front of each other's planes."""
+    n = mesh.patch_normal[q]
+    first = mesh.sender_start[mesh.patch_sender[q]]
+    d = 0.0
+    for axis in range(3):
+        d += n[axis] * mesh.sender_corners[first, axis]
+    in_front = False
+    for i in range(mesh.sender_start[mesh.patch_sender[patch]], mesh.sender_start[mesh.patch_sender[patch + 1]]):
+        c = mesh.sender_corners[i]
+        if n[0] * c[0] + n[1] * c[1] + n[2] * c[2] > d + slack:
+            in_front = True
+            break
+    return in_front
+
+
+@njit(nogil=True, cache=True)
+def shoot(
+    patch, first, last, geo, mesh, limit, error, floor, levels, closed_forms, factor, spread, rays, work, tally
+):  # fmt: skip
+    """Form factors from the elements of the groups ``first..last`` to one patch.
+
+    ``factor[e]`` gets the area-averaged form factor from element ``e`` to the patch, ``spread[e]`` the
+    estimate of its quadrature error.  Where rays must decide, ``factor[e]`` is the *unoccluded* form
+    factor and ``rays[e]`` is set.  The wanted error of a form factor F is ``error * F + floor``;
+    ``closed_forms`` asks for the closed form of every unoccluded pair, not only of near ones.
+    """
+    own_low, own_high = mesh.patch_bounds[patch, 0], mesh.patch_bounds[patch, 1]
+    flat_sender = mesh.patch_polygon[patch] >= 0
+    for q in range(first, last):
+        e0, e1 = mesh.patch_start[q], mesh.patch_start[q + 1]
+        flat = mesh.patch_polygon[q] >= 0
+        if q == patch and flat:
+            continue
+        if (flat and not _group_faces(q, patch, mesh, geo.slack)) or (
+            flat_sender and not _group_faces(patch, q, mesh, geo.slack)
+        ):
+            tally[_HORIZON] += e1 - e0
+            continue
+        # Shaft from the group to the patch; its candidates serve every element of the group.
+        used = box_shaft(mesh.patch_bounds[q, 0], mesh.patch_bounds[q, 1], own_low, own_high, work.shaft)
+        # A polygon that only touches the shaft from outside (the floor between two walls) meets a
+        # null set of segments: areas are integrated here, so the planes move inward by a hair.
+        for k in range(used):
+            work.shaft[k, 3] += 2.0 * geo.slack
+        # A polygon behind or in the plane of either end blocks nothing between them.
+        if flat:
+            n = mesh.patch_normal[q]
+            c = mesh.sender_corners[mesh.sender_start[mesh.patch_sender[q]]]
+            work.shaft[used, 0], work.shaft[used, 1], work.shaft[used, 2] = n[0], n[1], n[2]
+            work.shaft[used, 3] = n[0] * c[0] + n[1] * c[1] + n[2] * c[2] + 2.0 * geo.slack
+            used += 1
+        if flat_sender:
+            n = mesh.patch_normal[patch]
+            c = mesh.sender_corners[mesh.sender_start[mesh.patch_sender[patch]]]
+            work.shaft[used, 0], work.shaft[used, 1], work.shaft[used, 2] = n[0], n[1], n[2]
+            work.shaft[used, 3] = n[0] * c[0] + n[1] * c[1] + n[2] * c[2] + 2.0 * geo.slack
+            used += 1
+        tally[_SHAFT] += 1
+        many = boxes_meeting_planes(
+            geo.low, geo.high, geo.skip, geo.first, geo.count, geo.order, geo.bounds,
+            work.shaft, used, geo.slack, work.found, tally,
+        )  # fmt: skip
+        count = -1
+        if many <= MAX_CANDIDATES:
+            count = 0
+            for i in range(many):
+                piece = work.found[i]
+                polygon = geo.piece_polygon[piece]
+                if (flat and polygon == mesh.polygon[e0]) or (flat_sender and polygon == mesh.patch_polygon[patch]):
+                    continue
+                tally[_STEST] += 1
+                if outside_planes(
+                    geo.corners, geo.piece_start[piece], geo.piece_start[piece + 1], work.shaft, used, geo.slack
+                ):
+                    tally[_SCULL] += 1
+                    continue
+                work.found[count] = piece
+                count += 1
+            if count == 0:
+                tally[_EMPTY] += 1
+        for e in range(e0, e1):
+            gap = _box_distance(mesh.centroid, e, mesh.patch_bounds, patch)
+            area = mesh.area[e]
+            open_factor, doubt = _clear_factor(
+                e, patch, gap, geo, mesh, error, floor, flat_sender or count == 0, closed_forms, work, tally
+            )
+            if open_factor <= 0.0:
+                tally[_HORIZON] += 1
+                continue
+            tally[_LINK] += 1
+            if count == 0:
+                factor[e] = open_factor
+                spread[e] = doubt
+                continue
+            allowed = (error * open_factor + floor) * area
+            own = mesh.polygon[e]
+            depth = levels
+            if open_factor < floor:
+                depth = 0  # too faint to be worth a second look
+            value, doubt = element_integral(
+                e, patch, geo, mesh, work.found, count, limit, allowed, depth, own, work, tally
+            )
+            if value < 0.0:
+                factor[e] = open_factor
+                rays[e] = True
+            else:
+                # Rounding or a rule's error may not lift a part above the whole.
+                factor[e] = min(value / area, open_factor)
+                spread[e] = doubt / area
+
+
+@njit(nogil=True, cache=True)
+def longest_ring(starts):
+    """Largest number of corners among rings."""
+    longest = 0
+    for i in range(starts.shape[0] - 1):
+        longest = max(longest, starts[i + 1] - starts[i])
+    return longest

@@ -1,0 +1,114 @@
+"""Full form factors and one linear solve: the judge of the other solvers on small scenes."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from radiosity.form_factors.bundle import ReceiverBundles
+from radiosity.solvers.solution import Progress, ProgressEvent, Solution
+
+__all__ = ["balance_rows", "solve_direct"]
+
+FloatArray = NDArray[np.float64]
+
+COLUMNS_A_STEP = 32
+
+
+def balance_rows(exchange: FloatArray, areas: FloatArray, rounds: int = 200) -> FloatArray:
+    """Scale exchange areas so that each row of form factors sums to 1, keeping reciprocity.
+
+    The symmetric matrix S is scaled to ``x_i x_j S_ij`` with row sums ``A_i`` (cf. J. van Leersum,
+    "A method for determining a consistent set of radiation view factors", 1989; here by symmetric
+    iterative scaling, which keeps zeros and signs).
+
+    Parameters
+    ----------
+    exchange : (n, n) float
+        Symmetric exchange areas A_i F_ij of a closed scene.
+    areas : (n,) float
+    rounds : int
+        Most iterations; it ends once the rows agree to 1e-14.
+
+    Returns
+    -------
+    (n, n) float
+    """
+    x = np.ones(len(areas))
+    for _ in range(rounds):
+        ratio = areas / np.maximum(x * (exchange @ x), 1e-300)
+        x *= np.sqrt(ratio)
+        if np.abs(ratio - 1.0).max() < 1e-14:
+            break
+    return exchange * x * x[:, None]
+
+
+def solve_direct(
+    solution: Solution, bundles: ReceiverBundles, *, closed: bool, progress: Progress | None = None
+) -> None:
+    """Solve ``B = E + rho F B`` with the full matrix of form factors between elements.
+
+    Every element must be its own patch.  ``F`` is made reciprocal by averaging both directions; in
+    a closed scene its rows are then balanced.  Both corrections are reported, with the row sums
+    as found.  Ctrl-C before the end leaves the emission alone as the solution.
+    """
+    mesh, record = solution.mesh, solution.record
+    n = mesh.element_count
+    start = time.perf_counter()
+    factor = np.zeros((n, n))
+    doubt = np.zeros(n)
+    solution.converged, solution.stopped = False, "interrupted"
+    try:
+        for first in range(0, n, COLUMNS_A_STEP):
+            if progress is not None:
+                progress(ProgressEvent(first, 1.0, 0.5, time.perf_counter() - start, "form factors"))
+            chosen = np.arange(first, min(first + COLUMNS_A_STEP, n))
+            with record.stage("form factors"):
+                columns = bundles.columns(chosen)
+            factor[:, chosen] = columns.factor.T
+            doubt += columns.spread.sum(axis=0)
+    except KeyboardInterrupt:
+        record.counters.merge(bundles.counters)
+        return
+    with record.stage("solve"):
+        area = mesh.element_area
+        exchange = factor * area[:, None]
+        scale = max(float(exchange.max()), 1e-300)
+        sums = factor.sum(axis=1)
+        record.errors["row_sum"] = {
+            "min": float(sums.min()),
+            "mean": float(sums.mean()),
+            "max": float(sums.max()),
+            "stated_error": float(doubt.max()),
+            "rows": n,
+        }
+        record.errors["reciprocity"] = float(np.abs(exchange - exchange.T).max() / scale)
+        exchange = 0.5 * (exchange + exchange.T)
+        if closed:
+            balanced = balance_rows(exchange, area)
+            record.errors["row_balance_correction"] = float(np.abs(balanced - exchange).max() / scale)
+            exchange = balanced
+        factor = exchange / area[:, None]
+        before = solution.unshot.copy()
+        for band in range(mesh.bands):
+            rho = mesh.reflectance[:, band]
+            system = np.eye(n) - rho[:, None] * factor
+            solution.radiosity[:, band] = scipy.linalg.solve(system, before[:, band])
+        arriving = factor @ solution.radiosity
+        solution.irradiance += arriving
+        solution.unshot[:] = 0.0
+        book = solution.book
+        shot, received = area @ solution.radiosity, area @ arriving
+        book.shot += shot
+        book.received += received
+        book.absorbed += area @ ((1.0 - mesh.reflectance) * arriving)
+        book.escaped += shot - received
+    record.counters.merge(bundles.counters)
+    record.counters.add(shots=n)
+    record.seconds["inside embree, summed over threads"] = bundles.seconds_in_embree
+    record.errors["remaining_bound"] = 0.0
+    record.errors["energy_imbalance"] = book.imbalance(solution.unshot_power)
+    solution.converged, solution.stopped = True, "solved"

@@ -1,0 +1,140 @@
+"""Light that arrives from outside the mesh: lights without surface, and the background.
+
+Both reach the elements before the first shot, through Embree.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from radiosity.form_factors.bundle import place_on_pieces, stream
+from radiosity.patches import PatchMesh
+from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
+from workbench.scene.model import Light, Scene
+
+__all__ = ["incident_irradiance"]
+
+FloatArray = NDArray[np.float64]
+
+POINTS = 4
+"""Points an element at which lights without surface are evaluated."""
+
+# Generalised golden ratio in two dimensions.
+_G2 = 1.3247179572447460
+
+
+@njit(nogil=True, cache=True)
+def _element_points(corners, piece_start, element_piece, area, first, last, count, seed, out):
+    for e in range(first, last):
+        h = stream(e, 0, seed)
+        s1 = np.float64(h & np.uint64(0xFFFFFF)) / 16777216.0
+        s2 = np.float64((h >> np.uint64(24)) & np.uint64(0xFFFFFF)) / 16777216.0
+        for k in range(count):
+            place_on_pieces(
+                corners, piece_start, element_piece[e], element_piece[e + 1], area[e],
+                (s1 + (k + 0.5) / _G2) % 1.0, (s2 + (k + 0.5) / _G2**2) % 1.0, out[(e - first) * count + k],
+            )  # fmt: skip
+
+
+def _points(mesh: PatchMesh, first: int, last: int, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    points = np.empty(((last - first) * count, 3))
+    _element_points(
+        mesh.corners, mesh.piece_start, mesh.element_piece, mesh.element_area, first, last, count, seed, points
+    )
+    return points, np.repeat(mesh.element_normal[first:last], count, axis=0)
+
+
+def _from_light(light: Light, points: FloatArray, normals: FloatArray, tracer: EmbreeAccelerator, k: int) -> FloatArray:
+    """Irradiance per unit power at points, from a light without surface or one sample of it."""
+    start = points + tracer.offset * normals
+    if light.kind == "directional":
+        assert light.direction is not None
+        toward = np.broadcast_to(-light.direction, points.shape)
+        cosine = np.maximum(np.einsum("ij,ij->i", normals, toward), 0.0)
+        lit = np.flatnonzero(cosine > 0)
+        cosine[lit[tracer.occluded(start[lit], toward[lit], np.inf)]] = 0.0
+        return cosine
+    assert light.position is not None
+    place = light.position
+    length = 1.0
+    if light.kind == "linear":
+        assert light.end is not None
+        place = light.position + (k + 0.5) / POINTS * (light.end - light.position)
+        length = float(np.linalg.norm(light.end - light.position))
+    toward = place - points
+    distance = np.linalg.norm(toward, axis=1)
+    safe = np.where(distance > 0, distance, 1.0)
+    value = np.maximum(np.einsum("ij,ij->i", normals, toward), 0.0) / safe**3 * length
+    if light.kind == "spot":
+        assert light.direction is not None
+        along = -(toward @ light.direction) / safe
+        inside = along >= math.cos(math.radians(light.cone_deg))
+        value *= np.where(inside, np.maximum(along, 0.0) ** light.exponent, 0.0)
+    elif light.kind == "linear" and light.lambertian:
+        assert light.end is not None
+        axis = (light.end - light.position) / length
+        value *= np.sqrt(np.maximum(1.0 - ((toward @ axis) / safe) ** 2, 0.0))
+    lit = np.flatnonzero(value > 0)
+    value[lit[tracer.occluded(start[lit], place - start[lit], 1.0)]] = 0.0
+    return value
+
+
+def _from_background(
+    mesh: PatchMesh, first: int, last: int, count: int, seed: int, tracer: EmbreeAccelerator
+) -> FloatArray:
+    """Share of cosine-weighted directions that miss everything, (elements,)."""
+    points, normals = _points(mesh, first, last, count, seed)
+    rng = np.random.default_rng([seed, first])
+    shift = np.repeat(rng.random((last - first, 2)), count, axis=0)
+    k = np.tile(np.arange(count), last - first)
+    u = ((k + 0.5) / count + shift[:, 0]) % 1.0
+    phi = 2.0 * math.pi * ((k / 1.6180339887498949 + shift[:, 1]) % 1.0)
+    # Malley's method: cosine-weighted directions are a disk lifted to the hemisphere.
+    radius, height = np.sqrt(u), np.sqrt(1.0 - u)
+    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    a = np.cross(helper, normals)
+    a /= np.linalg.norm(a, axis=1)[:, None]
+    b = np.cross(normals, a)
+    along = a * (radius * np.cos(phi))[:, None] + b * (radius * np.sin(phi))[:, None] + normals * height[:, None]
+    blocked = tracer.occluded(points + tracer.offset * normals, along, np.inf)
+    return 1.0 - blocked.reshape(-1, count).mean(axis=1)
+
+
+def incident_irradiance(
+    scene: Scene, mesh: PatchMesh, tracer: EmbreeAccelerator, *, background_rays: int = 128, seed: int = 0
+) -> FloatArray:
+    """Irradiance of every element from the lights without surface and from the background.
+
+    Parameters
+    ----------
+    scene, mesh : Scene, PatchMesh
+    tracer : EmbreeAccelerator
+        Over the scene's geometry.
+    background_rays : int
+        Cosine-distributed rays an element toward the background.
+    seed : int
+
+    Returns
+    -------
+    (n, bands) float
+        Irradiance. [W m-2]
+    """
+    out = np.zeros((mesh.element_count, mesh.bands))
+    if not scene.lights and (scene.closed or not scene.background.any()):
+        return out
+    step = max(1, BLOCK_RAYS // max(POINTS, background_rays))
+    for first in range(0, mesh.element_count, step):
+        last = min(first + step, mesh.element_count)
+        for light in scene.lights:
+            points, normals = _points(mesh, first, last, POINTS, seed)
+            samples = POINTS if light.kind == "linear" else 1
+            value = sum(_from_light(light, points, normals, tracer, k) for k in range(samples)) / samples
+            out[first:last] += np.asarray(value).reshape(-1, POINTS).mean(axis=1)[:, None] * light.power
+        if scene.background.any() and not scene.closed:
+            share = _from_background(mesh, first, last, background_rays, seed, tracer)
+            out[first:last] += share[:, None] * (math.pi * scene.background)
+    return out

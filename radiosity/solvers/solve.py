@@ -1,0 +1,258 @@
+"""The whole journey of a solve: scene, geometry, mesh, form factors, solver, solution."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any
+
+import numpy as np
+
+from radiosity.form_factors.bundle import LinkSettings, ReceiverBundles
+from radiosity.patches import PatchMesh, build_mesh, forecast_elements
+from radiosity.solvers.direct import solve_direct
+from radiosity.solvers.incident import incident_irradiance
+from radiosity.solvers.progressive import shoot_until
+from radiosity.solvers.solution import EnergyBook, Progress, Solution
+from workbench.errors import InputError, OptionError
+from workbench.geometry.flat import Geometry
+from workbench.memory import require_memory
+from workbench.record import RunRecord
+from workbench.scene.model import Scene
+
+__all__ = ["solve"]
+
+METHODS = ("auto", "progressive", "direct")
+
+DEFAULT_ELEMENTS = 2000
+DIRECT_ELEMENTS = 64
+"""Scenes of at most this many elements are solved directly, with form factors good to 1e-8."""
+
+ONE_LEVEL_ELEMENTS = 1600
+"""Up to this many elements, each shoots for itself; above, patches of 2 x 2 elements shoot."""
+
+# Bytes an element costs while a mesh is made and solved, beside its bands.
+_ELEMENT_BYTES = 3000
+
+
+def _form_factor_error(elements: int, method: str) -> float:
+    """Default accuracy of form factors: what costs nothing is done well."""
+    if elements <= DIRECT_ELEMENTS:
+        return 1e-8
+    return 1e-3 if method == "direct" else 0.02
+
+
+def _settings(error: float, rays: int, seed: int, patches: int) -> LinkSettings:
+    """Link settings for a relative form-factor error."""
+    tight = error < 1e-3
+    return LinkSettings(
+        rays=rays,
+        error=error,
+        floor=0.1 * error / max(patches, 1),
+        candidates=40 if tight else 12,
+        # Each level halves an element; a shadow edge needs about log2(1 / error) of them.
+        levels=min(max(3, math.ceil(math.log2(1.0 / error)) - 2), 20),
+        closed_forms=tight,
+        seed=seed,
+    )
+
+
+def _check(
+    scene: Scene, method: str, elements: int | None, max_edge: float | None, rays: int, tolerance: float, workers: int
+) -> None:
+    if method not in METHODS:
+        raise OptionError(f"method: found {method!r}, expected one of {', '.join(METHODS)}")
+    if elements is not None and max_edge is not None:
+        raise OptionError("elements and max_edge were both given; choose one of them")
+    if elements is not None and elements < 1:
+        raise OptionError(f"elements: found {elements}, expected 1 or more")
+    if max_edge is not None and not (math.isfinite(max_edge) and max_edge > 0):
+        raise OptionError(f"max_edge: found {max_edge}, expected a positive length")
+    if rays < 1:
+        raise OptionError(f"rays: found {rays}, expected 1 or more")
+    if not 0 < tolerance < 1:
+        raise OptionError(f"tolerance: found {tolerance}, expected a number between 0 and 1")
+    if workers < 1:
+        raise OptionError(f"workers: found {workers}, expected 1 or more")
+    where = str(scene.path) if scene.path is not None else scene.name
+    if not scene.surfaces:
+        raise InputError(f"{where}: found no surface; add a [[surface]] to the scene")
+    if not scene.has_emitter:
+        raise InputError(
+            f"{where}: found no emitter, expected a material with emission, a light or a background; add one"
+        )
+    reflectance = np.stack([surface.material.reflectance for surface in scene.surfaces])
+    if scene.closed and (reflectance.min(axis=0) >= 1.0).any():
+        raise InputError(
+            f"{where}: found reflectance 1 on every surface of a closed scene, which has no solution;"
+            " lower one reflectance below 1"
+        )
+
+
+def _forecast(scene: Scene, elements: int | None, max_edge: float | None, method: str) -> None:
+    """Refuse a mesh or matrix that cannot fit in memory, before it is made."""
+    count = float(elements) if elements is not None else float(forecast_elements(scene, max_edge or math.inf))
+    advice = "ask for fewer elements or a larger max_edge"
+    require_memory(count * (_ELEMENT_BYTES + 64 * scene.bands), f"a mesh of {count:.3g} elements", advice)
+    if method == "direct":
+        require_memory(32.0 * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", advice)
+
+
+def _start(scene: Scene, mesh: PatchMesh, incident: np.ndarray, record: RunRecord) -> Solution:
+    """The solution before the first shot: emission, and light from outside the mesh reflected once."""
+    area = mesh.element_area
+    reflected = mesh.reflectance * incident
+    book = EnergyBook.empty(mesh.bands)
+    book.emitted = area @ (mesh.emission + incident)
+    book.received = area @ incident
+    book.absorbed = area @ (incident - reflected)
+    return Solution(
+        scene=scene,
+        mesh=mesh,
+        radiosity=mesh.emission + reflected,
+        irradiance=incident.copy(),
+        unshot=mesh.emission + reflected,
+        book=book,
+        record=record,
+        direct_irradiance=incident,
+    )
+
+
+def _resumed(scene: Scene, mesh: PatchMesh, previous: Solution, record: RunRecord) -> Solution:
+    """Go on from ``previous`` if it belongs to the same mesh and materials."""
+    same = previous.mesh.corners.shape == mesh.corners.shape and all(
+        np.array_equal(getattr(previous.mesh, name), getattr(mesh, name))
+        for name in ("corners", "piece_start", "patch_start", "reflectance", "emission")
+    )
+    if not same:
+        raise InputError(
+            "resume: the saved solution has another mesh or other materials; give the same scene and mesh options,"
+            " or solve without resume"
+        )
+    record.counters.merge(previous.record.counters)
+    record.seconds.update(previous.record.seconds)
+    return Solution(
+        scene=scene,
+        mesh=mesh,
+        radiosity=previous.radiosity,
+        irradiance=previous.irradiance,
+        unshot=previous.unshot,
+        book=previous.book,
+        record=record,
+        direct_irradiance=previous.direct_irradiance,
+    )
+
+
+def solve(
+    scene: Scene,
+    *,
+    method: str = "auto",
+    elements: int | None = None,
+    max_edge: float | None = None,
+    rays: int = 16,
+    tolerance: float = 0.01,
+    form_factor_error: float | None = None,
+    workers: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    resume: Solution | None = None,
+) -> Solution:
+    """Solve a scene for radiosity.
+
+    Parameters
+    ----------
+    scene : Scene
+        From :func:`workbench.load` or built in code.
+    method : str
+        ``progressive`` (shooting), ``direct`` (full matrix; small scenes), or ``auto``.
+    elements : int, optional
+        About how many elements; 1 gives one a polygon.  Default 2,000 (or one a polygon, if there
+        are more polygons).
+    max_edge : float, optional
+        Longest element edge instead. [scene lengths]
+    rays : int
+        Rays from an element toward a patch, where only rays can tell how much it sees.
+    tolerance : float
+        Stop when the bound on the light still missing falls below this share of all light.
+    form_factor_error : float, optional
+        Wanted relative error of each form factor; chosen from the number of elements by default.
+    workers : int, optional
+        Threads, all cores by default.  The answer does not depend on it.
+    seed : int
+        Of the rays.
+    progress : callable, optional
+        Called with a :class:`ProgressEvent` at every step.
+    resume : Solution, optional
+        An earlier solution of the same scene and mesh to go on from.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    InputError, OptionError
+        If the scene sends no light, has no solution, or an option is out of range.
+    MemoryForecastError
+        If the mesh or matrix would not fit in memory.
+
+    Notes
+    -----
+    Specular reflection and refraction are left to the picture: their share is absorbed here.
+    """
+    count = workers if workers is not None else len(os.sched_getaffinity(0))
+    _check(scene, method, elements, max_edge, rays, tolerance, count)
+    if elements is None and max_edge is None:
+        elements = DEFAULT_ELEMENTS
+    _forecast(scene, elements, max_edge, method)
+    settings: dict[str, Any] = {
+        "scene": scene.name,
+        "method": method,
+        "elements": elements,
+        "max_edge": max_edge,
+        "rays": rays,
+        "tolerance": tolerance,
+        "form_factor_error": form_factor_error,
+        "workers": count,
+        "seed": seed,
+    }
+    record = RunRecord(command="solve", settings=settings)
+    with record.stage("mesh"):
+        geometry = Geometry.from_scene(scene)
+        mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge)
+    n = mesh.element_count
+    if method == "auto":
+        method = "direct" if n <= DIRECT_ELEMENTS else "progressive"
+        record.choices["method"] = f"{method}: {n} elements, direct up to {DIRECT_ELEMENTS}"
+    if mesh.patch_count < n and (method == "direct" or n <= ONE_LEVEL_ELEMENTS):
+        with record.stage("mesh"):
+            mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=method != "direct")
+        n = mesh.element_count
+        _forecast(scene, n, None, method)
+    error = form_factor_error if form_factor_error is not None else _form_factor_error(n, method)
+    if not 0 < error < 1:
+        raise OptionError(f"form_factor_error: found {error}, expected a number between 0 and 1")
+    record.choices["form_factor_error"] = f"{error:g}"
+    if any(surface.material.specular.any() for surface in scene.surfaces):
+        record.choices["specular"] = "mirror reflection is left to pictures; its share is absorbed"
+    with record.stage("prepare"):
+        bundles = ReceiverBundles(geometry, mesh, _settings(error, rays, seed, mesh.patch_count), count)
+    try:
+        if resume is None:
+            with record.stage("incident light"):
+                incident = incident_irradiance(scene, mesh, bundles.accelerator, seed=seed)
+            solution = _start(scene, mesh, incident, record)
+            record.counters.merge(bundles.accelerator.counters)
+        else:
+            solution = _resumed(scene, mesh, resume, record)
+        if method == "direct":
+            solve_direct(solution, bundles, closed=scene.closed, progress=progress)
+        else:
+            shoot_until(solution, bundles, tolerance=tolerance, progress=progress)
+    finally:
+        bundles.close()
+    record.errors["facet_error"] = mesh.facet_error
+    record.results.update(
+        elements=n, patches=mesh.patch_count, energy_book=solution.book.as_dict(), stopped=solution.stopped
+    )
+    return solution
