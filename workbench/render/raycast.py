@@ -25,7 +25,7 @@ from workbench.render.shading import phong, turn_toward
 from workbench.scene.model import Material, Scene, Surface
 from workbench.scene.sc import ScPolygon, ScScene, ScSphere
 
-__all__ = ["ACCELERATORS", "CastPicture", "RayCaster", "tests_per_ray"]
+__all__ = ["ACCELERATORS", "CastPicture", "RayCaster", "average_tests"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -58,7 +58,7 @@ class CastPicture:
     counters: Counters
 
 
-def tests_per_ray(counters: Counters) -> dict[str, float]:
+def average_tests(counters: Counters) -> dict[str, float]:
     """Average number of intersection tests per ray: spheres, polygons, the two bounding volumes, sum."""
     rays = max(counters["rays"], 1)
     found = {

@@ -97,7 +97,7 @@ def main(
     with record.stage("read"):
         scene = read_sc(files)
     with record.stage("prepare"):
-        from workbench.render.raycast import RayCaster, tests_per_ray
+        from workbench.render.raycast import RayCaster, average_tests
 
         caster = RayCaster(scene, volumes=volumes, accelerator=accelerator, size=size, workers=workers)
         # Two rays first: they load, or on the first run of all compile, the kernels.
@@ -119,7 +119,7 @@ def main(
     record.counters = picture.counters
     record.results = {"primitives": len(scene.primitives), "groups": len(scene.groups)}
     if accelerator != "embree":
-        record.results["tests_per_ray"] = tests_per_ray(picture.counters)
+        record.results["tests_per_ray"] = average_tests(picture.counters)
     to_screen = str(json_path) != "-"
     if to_screen:
         _report(record)
