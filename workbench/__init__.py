@@ -20,8 +20,11 @@ __all__ = ["__version__", "load"]
 
 
 def __getattr__(name: str) -> Any:
+    value: Any
     if name == "load":
-        from workbench.scene.load import load as value
+        from workbench.scene import load as reader
+
+        value = reader.load
     elif name == "__version__":
         from importlib.metadata import PackageNotFoundError, version
 

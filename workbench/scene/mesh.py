@@ -99,11 +99,20 @@ def _material(name: str, reflectance: Any = DEFAULT_REFLECTANCE, **given: Any) -
     )
 
 
-def _mean_colour(image: Any) -> FloatArray:
+_TEXTURE_USED = "textures count with their mean colour"
+_TEXTURE_ABSENT = "textures that are missing or unreadable were left out"
+
+
+def _mean_colour(image: Any, notes: Counter[str]) -> FloatArray | None:
     """Mean linear colour (3,) of a PIL image whose values are sRGB (IEC 61966-2-1)."""
+    try:
+        counts = np.asarray(image.convert("RGB").histogram(), dtype=float).reshape(3, 256)
+    except Exception:  # pictures are decoded only here, and a broken one may fail in any way
+        notes[_TEXTURE_ABSENT] += 1
+        return None
+    notes[_TEXTURE_USED] += 1
     level = np.arange(256) / 255.0
     linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
-    counts = np.asarray(image.convert("RGB").histogram(), dtype=float).reshape(3, 256)
     return counts @ linear / counts.sum(axis=1)
 
 
@@ -237,7 +246,7 @@ def _read_mtl(path: Path, name: str, notes: Counter[str]) -> dict[str, Material]
         raise SceneError(f"material file {name!r}: cannot be read ({_brief(error)})", path=path) from None
     missing = text.lower().count("map_kd") - sum("image" in record for record in records.values())
     if missing:
-        notes["textures that are missing or unreadable were left out"] += missing
+        notes[_TEXTURE_ABSENT] += missing
     return {key: _checked(_mtl_material(key, record, path, notes), path, notes) for key, record in records.items()}
 
 
@@ -247,20 +256,22 @@ def _mtl_material(name: str, record: dict[str, Any], path: Path, notes: Counter[
     def numbers(key: str, default: float) -> FloatArray:
         value = record.get(key, default)
         try:
-            values = np.atleast_1d(np.asarray(value, dtype=np.float64))
-            return np.array(np.broadcast_to(values, 3))
+            values = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), 3))
+            if not np.isfinite(values).all():
+                raise ValueError
+            return values
         except (TypeError, ValueError):
             raise SceneError(
-                f"material {name!r}: found {key} {str(value)[:60]}, expected one or three numbers; correct the file",
+                f"material {name!r}: found {key} {str(value)[:60]}, expected one or three finite numbers; "
+                "correct the file",
                 path=path,
             ) from None
 
     reflectance = numbers("kd", DEFAULT_REFLECTANCE)
-    if "image" in record:
-        colour = _mean_colour(record["image"])
+    colour = _mean_colour(record["image"], notes) if "image" in record else None
+    if colour is not None:
         # Exporters write Kd 0 or none beside a texture that carries the whole colour.
         reflectance = reflectance * colour if "kd" in record and reflectance.any() else colour
-        notes["textures count with their mean colour"] += 1
     illumination = int(numbers("illum", 2.0)[0])
     opaque = float(numbers("d", 1.0)[0])
     glass = illumination in (4, 6, 7, 9) and "tf" in record
@@ -269,7 +280,7 @@ def _mtl_material(name: str, record: dict[str, Any], path: Path, notes: Counter[
         reflectance * (1.0 if glass else opaque),
         emission=numbers("ke", 0.0),
         specular=numbers("ks", 0.0) if illumination >= 2 else 0.0,
-        exponent=np.inf if illumination >= 3 else numbers("ns", 0.0)[0],
+        exponent=np.inf if illumination >= 3 else max(numbers("ns", 0.0)[0], 0.0),
         transmittance=numbers("tf", 0.0) if glass else 1.0 - opaque,
         ior=max(float(numbers("ni", 1.0)[0]), 1e-3),
     )
@@ -318,7 +329,7 @@ def _read_by_trimesh(path: Path) -> tuple[list[_Part], dict[str, Material], Coun
             faces = faces[:, ::-1]
         if normals is not None and abs(np.linalg.det(linear)) > 0:
             normals = normals @ np.linalg.inv(linear)
-        material = getattr(mesh.visual, "material", None) if mesh.visual.kind == "texture" else None
+        material = getattr(mesh.visual, "material", None)
         key = ""
         if isinstance(material, trimesh.visual.material.PBRMaterial):
             key = keys.get(id(material), "")
@@ -338,12 +349,13 @@ def _pbr_material(name: str, material: Any, notes: Counter[str]) -> Material:
     # trimesh keeps factors as bytes: 0.8 comes back as 204.
     base = np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64) / 255.0
     reflectance = base[:3]
-    if material.baseColorTexture is not None:
-        reflectance = reflectance * _mean_colour(material.baseColorTexture)
-        notes["textures count with their mean colour"] += 1
     emission = np.zeros(3) if material.emissiveFactor is None else np.asarray(material.emissiveFactor, dtype=np.float64)
+    if material.baseColorTexture is not None:
+        colour = _mean_colour(material.baseColorTexture, notes)
+        reflectance = reflectance if colour is None else reflectance * colour
     if material.emissiveTexture is not None:
-        emission = emission * _mean_colour(material.emissiveTexture)
+        colour = _mean_colour(material.emissiveTexture, notes)
+        emission = emission if colour is None else emission * colour
     opaque = base[3] if material.alphaMode == "BLEND" else 1.0
     return _material(
         name,
@@ -462,8 +474,8 @@ def _agree(part: _Part, name: str, notes: Counter[str]) -> tuple[_Part, bool]:
     edge = np.column_stack([corner, corner[following]])
     low, high = edge.min(axis=1), edge.max(axis=1)
     _, key, count = np.unique(low * (corner.max() + 1) + high, return_inverse=True, return_counts=True)
-    pairs = np.flatnonzero(count[key] == 2)
-    pairs = pairs[np.argsort(key[pairs], kind="stable")].reshape(-1, 2)
+    shared = np.flatnonzero(count[key] == 2)
+    pairs = shared[np.argsort(key[shared], kind="stable")].reshape(-1, 2)
     first, second = face[pairs].T
     against = edge[pairs[:, 0], 0] == edge[pairs[:, 1], 0]  # both run the same way
     if not against.any():
@@ -518,6 +530,8 @@ def read_mesh(path: str | Path) -> MeshSurfaces:
         If the file cannot be read, has no face with area, or holds a value out of range.
     """
     path = Path(path)
+    if not path.name.lower().endswith(MESH_SUFFIXES):
+        raise SceneError(f"found an unknown kind of mesh, expected one of {', '.join(MESH_SUFFIXES)}", path=path)
     is_obj = path.name.lower().endswith((".obj", ".obj.gz"))
     parts, materials, notes = _read_obj(path) if is_obj else _read_by_trimesh(path)
     surfaces = []

@@ -61,7 +61,17 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, StrictInt, StrictStr, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    StrictInt,
+    StrictStr,
+    ValidationError,
+)
 
 from workbench.errors import InputError, SceneError
 from workbench.geometry.polygons import vector_area
@@ -81,8 +91,9 @@ Key = tuple[str | int, ...]
 
 
 def _show(value: Any) -> str:
-    """A value as it may stand in a one-line message."""
-    return reprlib.repr(value)
+    """A value as it may stand in a one-line message: printable, and not endless."""
+    text = reprlib.repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _number(value: Any) -> float:
@@ -104,6 +115,12 @@ def _exponent(value: Any) -> float:
 def _above_zero(value: float) -> float:
     if not value > 0:
         raise ValueError(f"found {value:g}, expected a number greater than 0")
+    return value
+
+
+def _printable(value: str) -> str:
+    if not value.isprintable():
+        raise ValueError(f"found {_show(value)}, expected printable text on one line")
     return value
 
 
@@ -203,7 +220,7 @@ Bands = Annotated[Any, BeforeValidator(_bands)]
 Share = Annotated[Any, BeforeValidator(_share)]
 Ring = Annotated[Any, BeforeValidator(_ring)]
 Rings = Annotated[Any, BeforeValidator(_rings)]
-Text = Annotated[StrictStr, Field(min_length=1, max_length=200)]
+Text = Annotated[StrictStr, Field(min_length=1, max_length=200), AfterValidator(_printable)]
 Segments = Annotated[StrictInt, Field(ge=1, le=4096)]
 
 
@@ -271,7 +288,7 @@ class _Rotation(_Table):
 
 
 class _Step(_Table):
-    translate: Vector | None = None
+    translate: Vector = None
     rotate: _Rotation | None = None
     scale: Annotated[Any, BeforeValidator(lambda v: _vector(v) if isinstance(v, list) else _number(v))] = None
 
@@ -279,9 +296,9 @@ class _Step(_Table):
 class _SurfaceTable(_Table):
     name: Text
     material: Text | None = None
-    polygon: Ring | None = None
-    holes: Rings | None = None
-    polygons: Rings | None = None
+    polygon: Ring = None
+    holes: Rings = None
+    polygons: Rings = None
     mesh: Text | None = None
     box: _Box | None = None
     sphere: _Sphere | None = None
@@ -327,8 +344,8 @@ class _Area(_Table):
     name: Text
     type: Literal["area"]
     polygon: Ring
-    radiance: Bands | None = None
-    exitance: Bands | None = None
+    radiance: Bands = None
+    exitance: Bands = None
 
 
 _LIGHTS: dict[str, type[_Table]] = {
@@ -471,7 +488,7 @@ class _Builder:
 
     def _material(self, name: str, table: _MaterialTable) -> Material:
         shares = [self.spread(values) for values in (table.reflectance, table.specular, table.transmittance)]
-        total = float(sum(shares).max())
+        total = float(np.sum(shares, axis=0).max())
         if total > 1 + 1e-9:
             self.fail(
                 ("materials", name),
@@ -499,7 +516,11 @@ class _Builder:
             self.fail((*key, "material"), "found nothing, expected the name of a material; add it")
         if name not in self.materials:
             close = difflib.get_close_matches(name, self.materials, n=1)
-            known = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(self.materials) or 'none'}"
+            known = (
+                f"did you mean {close[0]!r}?"
+                if close
+                else f"known are {', '.join(map(_show, list(self.materials)[:20])) or 'none'}"
+            )
             self.fail((*key, "material"), f"found {name!r}, expected the name of a material; {known}")
         return self.materials[name]
 
@@ -525,11 +546,11 @@ class _Builder:
             shape = given[0]
             if table.holes is not None and shape != "polygon":
                 self.fail((*key, "holes"), f"found holes beside {shape}, expected them beside polygon only")
-            if shape == "mesh":
-                made = self._mesh(table, key)
+            if table.mesh is not None:
+                made = self._mesh(table, table.mesh, key)
             else:
                 try:
-                    made = [self._shape(shape, table, self.material_of(table.material, key), key)]
+                    made = [self._shape(table, self.material_of(table.material, key), key)]
                 except SceneError:
                     raise
                 except InputError as error:
@@ -545,10 +566,10 @@ class _Builder:
                     self.fail(key, f"found coordinates beyond {LARGEST:g}, expected smaller ones; rescale the scene")
                 yield surface
 
-    def _shape(self, shape: str, table: _SurfaceTable, material: Material, key: Key) -> Surface:
-        if shape == "polygon":
+    def _shape(self, table: _SurfaceTable, material: Material, key: Key) -> Surface:
+        if table.polygon is not None:
             return self.polygon(table.name, material, [[table.polygon, *(table.holes or [])]], [(*key, "polygon")])
-        if shape == "polygons":
+        if table.polygons is not None:
             keys = [(*key, "polygons", index) for index in range(len(table.polygons))]
             return self.polygon(table.name, material, [[ring] for ring in table.polygons], keys)
         if table.box is not None:
@@ -582,9 +603,9 @@ class _Builder:
             facet_error=facet_error(spline, *table.segments),
         )
 
-    def _mesh(self, table: _SurfaceTable, key: Key) -> list[Surface]:
+    def _mesh(self, table: _SurfaceTable, file: str, key: Key) -> list[Surface]:
         try:
-            mesh = read_mesh(self.path.parent / table.mesh)
+            mesh = read_mesh(self.path.parent / file)
         except SceneError as error:
             self.fail((*key, "mesh"), str(error))
         self.notes.extend(f"{table.name}: {note}" for note in mesh.notes)
@@ -702,7 +723,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         place = re.search(r" ?\(at line (\d+), column (\d+)\)$| ?\(at end of document\)$", message)
         line = None
         if place is not None:
-            line = int(place[1]) if place[1] else text.count("\n") + 1
+            line = int(place[1]) if place[1] else text.rstrip().count("\n") + 1
             message = message[: place.start()]
         raise SceneError(f"found no valid TOML ({message[:150]}); correct the line", path=path, line=line) from None
 
