@@ -32,7 +32,7 @@ _FOLDER = Path(__file__).resolve().parents[2] / "scenes"
 
 
 def _built_in_files() -> dict[str, Path]:
-    return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"))}
+    return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"), key=lambda path: path.stem)}
 
 
 def built_in_scenes() -> dict[str, str]:
