@@ -75,10 +75,8 @@ from pydantic import (
 
 from workbench.errors import InputError, SceneError
 from workbench.geometry.polygons import vector_area
-from workbench.geometry.splines import RationalSurface, clamped_knots, facet_error, tessellate
 from workbench.scene._tokens import LARGEST, LARGEST_SIDE, read_text
 from workbench.scene.library import box_surface, polygon_fault, sphere_surface, torus_knot_mesh, transformed
-from workbench.scene.mesh import read_mesh
 from workbench.scene.model import Camera, Light, Material, Scene, Surface
 
 __all__ = ["load_scene", "read_toml"]
@@ -587,6 +585,9 @@ class _Builder:
 
     @staticmethod
     def _spline(name: str, material: Material, table: Any) -> Surface:
+        # scipy.interpolate takes half a second to import; most scenes have no spline.
+        from workbench.geometry.splines import RationalSurface, clamped_knots, facet_error, tessellate
+
         points, (p, q) = table.points, table.degree
         for degree, count, axis in ((p, points.shape[0], "u"), (q, points.shape[1], "v")):
             if count <= degree:
@@ -604,6 +605,8 @@ class _Builder:
         )
 
     def _mesh(self, table: _SurfaceTable, file: str, key: Key) -> list[Surface]:
+        from workbench.scene.mesh import read_mesh
+
         try:
             mesh = read_mesh(self.path.parent / file)
         except SceneError as error:
