@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
@@ -49,10 +51,12 @@ def test_triangles_that_share_edges_cover_each_pixel_once(viewport):
     # grid and every diagonal runs exactly through centres; all coordinates are dyadic.
     centre = ((np.arange(viewport) + 0.5) / viewport - 0.5) / 2
     triangles = []
-    for x0, x1 in zip(centre[:-1], centre[1:], strict=True):
-        for y0, y1 in zip(centre[:-1], centre[1:], strict=True):
+    for x0, x1 in itertools.pairwise(centre):
+        for y0, y1 in itertools.pairwise(centre):
             a, b, c, d = (np.array([x, y, 1.0]) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1)))
-            triangles += [np.stack([a, b, c]), np.stack([a, c, d])] if x0 < 0 else [np.stack([a, b, d]), np.stack([b, c, d])]
+            triangles += (
+                [np.stack([a, b, c]), np.stack([a, c, d])] if x0 < 0 else [np.stack([a, b, d]), np.stack([b, c, d])]
+            )
     each = sum(blocked_pixels([triangle], viewport) for triangle in triangles)
     assert each == blocked_pixels(triangles, viewport) == (viewport - 1) ** 2
 
@@ -108,7 +112,9 @@ def test_a_parallelogram_fills_its_viewport_from_anywhere():
 
 
 def two_triangles() -> Geometry:
-    return geometry_of([np.array([[9.0, 9, 9], [9, 10, 9], [10, 9, 9]]), np.array([[9.0, 9, 8], [9, 10, 8], [10, 9, 8]])])
+    return geometry_of(
+        [np.array([[9.0, 9, 9], [9, 10, 9], [10, 9, 9]]), np.array([[9.0, 9, 8], [9, 10, 8], [10, 9, 8]])]
+    )
 
 
 def test_polygons_that_reach_behind_the_point_are_drawn_whole():

@@ -17,6 +17,7 @@ import ctypes
 import ctypes.util
 import sys
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,16 +73,24 @@ def gl_renderer() -> str:
             raise MissingLibraryError(f"lib{name}: not found; {_INSTALL}") from None
     _probe_device(ctypes.CDLL(ctypes.util.find_library("EGL") or "libEGL.so.1"))
     try:
-        import moderngl
+        import moderngl  # noqa: F401
     except ImportError:
         raise MissingLibraryError("moderngl: not found; pip install moderngl, or use backend='software'") from None
     try:
-        context = moderngl.create_context(standalone=True, backend="egl", require=330)
+        context = _context()
     except Exception as error:  # moderngl raises plain Exception whatever is wrong
         raise MissingLibraryError(f"OpenGL 3.3 on EGL: {error}; {_INSTALL}") from None
     name = str(context.info["GL_RENDERER"])
     context.release()
     return name
+
+
+def _context() -> Any:
+    """A context of its own, without a window."""
+    import moderngl
+
+    settings: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 330}
+    return moderngl.create_context(**settings)
 
 
 def _probe_device(egl: ctypes.CDLL) -> None:
@@ -128,7 +137,7 @@ class GLRasteriser:
         import moderngl
 
         self._gl = moderngl
-        context = moderngl.create_context(standalone=True, backend="egl", require=330)
+        context = _context()
         self._context = context
         self._program = context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
         self._colour = context.texture((atlas, atlas), 2, dtype="f1")

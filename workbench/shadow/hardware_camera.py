@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -237,7 +238,10 @@ def _samples(count: int, jitter: str, seed: int) -> FloatArray:
 def _lamp(light: ArrayLike | Sequence[ArrayLike], two_sided: bool) -> rasteriser.Lamp:
     """The light's convex pieces, and a basis of its plane if it is flat."""
     try:
-        rings = [as_points(light, "light")] if np.ndim(light[0]) == 1 else [as_points(ring, "light") for ring in light]
+        listed: list[Any] = list(light)  # type: ignore[arg-type]
+        rings = (
+            [as_points(listed, "light")] if np.ndim(listed[0]) == 1 else [as_points(ring, "light") for ring in listed]
+        )
     except (TypeError, IndexError):
         raise InputError("light: expected an (n, 3) polygon or a list of them") from None
     pieces: list[FloatArray] = []
@@ -253,7 +257,7 @@ def _lamp(light: ArrayLike | Sequence[ArrayLike], two_sided: bool) -> rasteriser
     size = float(np.ptp(corners, axis=0).max())
     off = np.abs((corners - corners[0]) @ normals[0]).max()
     planar = bool((normals @ normals[0] > 1 - 1e-9).all() and off <= 1e-7 * size)
-    basis = _flat_basis(pieces, normals[0], size)
+    basis = _flat_basis(pieces, normals[0], size) if planar else np.eye(3)[:2]
     return rasteriser.Lamp(
         corners,
         start,
@@ -267,7 +271,7 @@ def _lamp(light: ArrayLike | Sequence[ArrayLike], two_sided: bool) -> rasteriser
 
 
 def _flat_basis(pieces: list[FloatArray], normal: FloatArray, size: float) -> FloatArray:
-    """Two vectors (2, 3) along which to fit the viewport.
+    """Two vectors (2, 3) in a flat light's plane along which to fit the viewport.
 
     The sides of a parallelogram; otherwise those of the bounding rectangle of least area, which has
     a side along an edge of the convex hull.

@@ -108,7 +108,7 @@ def proxy_geometry(
     for index, (name, material) in enumerate(zip(geometry.surface_name, geometry.surface_material, strict=True)):
         mine = triangles[surface_of_triangle == index]
         if len(mine) <= smallest:
-            pieces = [geometry.piece(k) for k in np.flatnonzero(surface_of_piece == index)]
+            pieces = [geometry.piece(int(k)) for k in np.flatnonzero(surface_of_piece == index)]
             surfaces.append(Surface.from_polygons(name, material, pieces))
             continue
         vertices, faces = _simplified(mine, max(smallest, round(share * len(mine))))
@@ -132,7 +132,7 @@ def proxy_geometry(
 def _simplified(triangles: FloatArray, faces: int) -> tuple[FloatArray, NDArray[np.int64]]:
     """Vertices and faces of a mesh of about ``faces`` triangles."""
     try:
-        import fast_simplification
+        import fast_simplification  # type: ignore[import-untyped]
     except ImportError:
         raise MissingLibraryError("fast_simplification: not found; pip install fast_simplification") from None
     points, corner = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)

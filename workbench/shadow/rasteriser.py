@@ -80,7 +80,7 @@ class Occluders(NamedTuple):
     high: FloatArray
     skip: NDArray[np.int64]
     first: NDArray[np.int64]
-    count: NDArray[np.int64]
+    leaf: NDArray[np.int64]
     order: NDArray[np.int64]
     tolerance: float
 
@@ -303,7 +303,8 @@ def _fit(s, n, lamp, tolerance, viewport, angle, shift_u, shift_v, frame, g, lit
 def _boxes(s, n, g, far, occ, candidates, counts):
     """Polygons whose boxes meet the pyramid of the viewport, above S's tangent plane, before ``far``.
 
-    ``far`` 0 means no far plane.
+    ``far`` (4,) is a vector and the value that its product with P - S must stay below; a value of 0
+    means no far plane.
     """
     planes = np.empty((6, 4))
     for c in range(3):
@@ -312,16 +313,17 @@ def _boxes(s, n, g, far, occ, candidates, counts):
         planes[2, c] = g[2, c] - g[0, c]
         planes[3, c] = g[2, c] - g[1, c]
         planes[4, c] = n[c]
-        planes[5, c] = -g[2, c]
-    for k in range(6):
+        planes[5, c] = -far[c]
+    used = 6 if far[3] > 0.0 else 5
+    for k in range(used):
         length = np.sqrt(planes[k, 0] ** 2 + planes[k, 1] ** 2 + planes[k, 2] ** 2)
         for c in range(3):
             planes[k, c] /= length
-        planes[k, 3] = _dot(planes[k], s) - (far / length if k == 5 else 0.0)
+        planes[k, 3] = _dot(planes[k], s) - (far[3] / length if k == 5 else 0.0)
     tally = np.zeros(1, np.int64)
     met = boxes_meeting_planes(
-        occ.low, occ.high, occ.skip, occ.first, occ.count, occ.order, occ.bounds,
-        planes, 6 if far > 0.0 else 5, occ.tolerance, candidates, tally,
+        occ.low, occ.high, occ.skip, occ.first, occ.leaf, occ.order, occ.bounds,
+        planes, used, occ.tolerance, candidates, tally,
     )  # fmt: skip
     counts[BOX_TESTS] += tally[0]
     return met
@@ -331,9 +333,9 @@ def _boxes(s, n, g, far, occ, candidates, counts):
 def _gather(s, n, g, far, own, occ, width, height, window, every_size, candidates, boxes, large, counts):
     """Candidates that may block: the plane-vertex check of each polygon that :func:`_boxes` left.
 
-    The planes are the four sides of the pyramid, the tangent plane at S and, unless ``far`` is 0,
-    the far plane.  A polygon that only touches one is outside, for the centres of the pixels all
-    lie inside.  Polygons that S lies in (seen edge-on) and those of ``own`` block nothing.
+    The planes are the four sides of the pyramid, the tangent plane at S and the far plane.  A polygon
+    that only touches one is outside, for the centres of the pixels all lie inside.  Polygons that S
+    lies in (seen edge-on) and those of ``own`` block nothing.
 
     Returns the number of polygons that may block, and of those that must be drawn: not the ones
     that lie between the centres of the pixels, unless ``every_size`` is true.  The latter are left
@@ -349,7 +351,7 @@ def _gather(s, n, g, far, own, occ, width, height, window, every_size, candidate
         counts[CHECKS] += 1
         first, last = occ.start[piece], occ.start[piece + 1]
         most_x, most_y, most_rx, most_ry, most_n = -np.inf, -np.inf, -np.inf, -np.inf, -np.inf
-        low_w, low_u, low_v, high_u, high_v = np.inf, np.inf, np.inf, -np.inf, -np.inf
+        nearest, low_w, low_u, low_v, high_u, high_v = np.inf, np.inf, np.inf, np.inf, -np.inf, -np.inf
         for i in range(first, last):
             d0 = occ.corners[i, 0] - s[0]
             d1 = occ.corners[i, 1] - s[1]
@@ -360,10 +362,11 @@ def _gather(s, n, g, far, own, occ, width, height, window, every_size, candidate
             most_x, most_y, low_w = max(most_x, x), max(most_y, y), min(low_w, w)
             most_rx, most_ry = max(most_rx, w - x), max(most_ry, w - y)
             most_n = max(most_n, n[0] * d0 + n[1] * d1 + n[2] * d2)
+            nearest = min(nearest, far[0] * d0 + far[1] * d1 + far[2] * d2)
             if w > 0.0:
                 u, v = x / w, y / w
                 low_u, high_u, low_v, high_v = min(low_u, u), max(high_u, u), min(low_v, v), max(high_v, v)
-        if min(most_x, most_y, most_rx, most_ry, most_n) <= 0.0 or (far > 0.0 and low_w >= far):
+        if min(most_x, most_y, most_rx, most_ry, most_n) <= 0.0 or (far[3] > 0.0 and nearest >= far[3]):
             counts[CULLS] += 1
             continue
         lift = 0.0
@@ -639,7 +642,28 @@ def _scratch(lamp, occ):
         np.empty((len(occ.owner), 4), np.int32),
         np.empty(len(occ.owner), np.bool_),
         np.empty(4),
+        np.empty(4),
     )
+
+
+@njit(nogil=True, cache=True)
+def _far_plane(lamp, g, lit, lit_start, lit_normal, pieces, far):
+    """Vector and value (4,) of a plane beyond which nothing blocks, as :func:`_boxes` reads them.
+
+    Just before a flat light; otherwise across the mean normal of the parts of the light that face
+    S, through the vertex farthest that way.
+    """
+    if lamp.planar:
+        far[0], far[1], far[2], far[3] = g[2, 0], g[2, 1], g[2, 2], FAR
+        return
+    for c in range(3):
+        far[c] = 0.0
+        for piece in range(pieces):
+            away = _dot(lit_normal[piece], lit[lit_start[piece]])
+            far[c] += lit_normal[piece, c] if away > 0.0 else -lit_normal[piece, c]
+    far[3] = 0.0
+    for i in range(lit_start[pieces]):
+        far[3] = max(far[3], far[0] * lit[i, 0] + far[1] * lit[i, 1] + far[2] * lit[i, 2])
 
 
 @njit(nogil=True, cache=True)
@@ -649,7 +673,7 @@ def _prepare(s, n, own, lamp, occ, viewport, naive, every_size, sample, work, co
     In the optimised mode a point without candidates is NOT_INSHADOW, and one whose whole light
     stands behind one convex polygon is INSHADOW; neither is rendered.
     """
-    frame, g, lit, lit_start, lit_normal, points, edges, plane, candidates, boxes, large, window = work
+    frame, g, lit, lit_start, lit_normal, points, edges, plane, candidates, boxes, large, window, far = work
     state, pieces, determinant = _fit(
         s, n, lamp, occ.tolerance, viewport, sample[0], sample[1], sample[2], frame, g, lit, lit_start
     )
@@ -666,7 +690,7 @@ def _prepare(s, n, own, lamp, occ, viewport, naive, every_size, sample, work, co
             place = _dot(g[axis], lit[i]) / w
             window[axis] = min(window[axis], place)
             window[2 + axis] = max(window[2 + axis], place)
-    far = FAR if lamp.planar else 1.0
+    _far_plane(lamp, g, lit, lit_start, lit_normal, pieces, far)
     blocking, drawn = _gather(
         s, n, g, far, own, occ, viewport, viewport, window, every_size, candidates, boxes, large, counts
     )
@@ -704,7 +728,7 @@ def render_points(
     ``conservative``) and adds to ``counts`` (4,).
     """
     work = _scratch(lamp, occ)
-    frame, g, lit, lit_start, lit_normal, corners, edges, plane, candidates, boxes, _, _ = work
+    frame, g, lit, lit_start, lit_normal, corners, edges, plane, candidates, boxes, _, _, _ = work
     image = np.empty((viewport, viewport), np.uint8)
     limit = np.empty((viewport, viewport))
     for m in range(len(points)):
@@ -806,7 +830,7 @@ def emit_tiles(
     point, the number of tiles, and of vertices in the two buffers.
     """
     work = _scratch(lamp, occ)
-    frame, g, lit, lit_start, lit_normal, _, edges, plane, candidates, _, _, _ = work
+    frame, g, lit, lit_start, lit_normal, _, edges, plane, candidates, _, _, _, _ = work
     polygon, spare = np.empty((len(edges) + 6, 3)), np.empty((len(edges) + 6, 3))
     side = atlas // viewport
     tiles, light_fill, fill = 0, 0, 0
@@ -874,7 +898,7 @@ def draw_hemicubes(points, normals, turns, own, occ, resolution, owners, counts)
     frame, g = np.empty((3, 3)), np.empty((3, 3))
     candidates, large = np.empty(len(occ.owner), np.int64), np.empty(len(occ.owner), np.bool_)
     boxes = np.empty((len(occ.owner), 4), np.int32)
-    window = np.array([0.0, 0.0, 1.0, 1.0])
+    window, no_far = np.array([0.0, 0.0, 1.0, 1.0]), np.zeros(4)
     depth = np.empty((resolution, resolution))
     half = resolution // 2
     across = np.empty((4, 3))
@@ -903,7 +927,7 @@ def draw_hemicubes(points, normals, turns, own, occ, resolution, owners, counts)
             depth[:] = np.inf
             owners[m, begin : begin + height * resolution] = -1
             _, drawn = _gather(
-                s, n, g, 0.0, own[m], occ, resolution, height, window, False, candidates, boxes, large, counts
+                s, n, g, no_far, own[m], occ, resolution, height, window, False, candidates, boxes, large, counts
             )
             for k in range(drawn):
                 p = candidates[k]
