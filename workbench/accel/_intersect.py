@@ -32,6 +32,8 @@ END_ULPS = 64.0
 scene, are rounding of the end: a point on an edge of the floor does not shadow itself."""
 
 _EDGE_ON = 2.0**-26
+_OFF_EDGE = 2.0**-24
+_BEYOND = 2.0**-48
 _EPSILON = float(np.finfo(np.float64).eps)
 
 
@@ -120,15 +122,20 @@ def _tie(px, py, qx, qy):
 
 @njit(nogil=True, cache=True)
 def _along_edge(px, py, pz, qx, qy, qz):
-    # Depth of the point of the edge p-q that is nearest the ray.
+    # Depth of the point of the edge p-q that is nearest the ray; inf if the ray passes beyond the
+    # edge's ends or beside it: rounding may make all edge functions zero for corners in a row.
     ex, ey = qx - px, qy - py
-    share = -(px * ex + py * ey) / (ex * ex + ey * ey)
+    square = ex * ex + ey * ey
+    share = -(px * ex + py * ey) / square
+    x, y = px + share * ex, py + share * ey
+    if not -_BEYOND <= share <= 1.0 + _BEYOND or x * x + y * y > _OFF_EDGE * _OFF_EDGE * square:
+        return math.inf
     return pz + min(max(share, 0.0), 1.0) * (qz - pz)
 
 
 @njit(nogil=True, cache=True)
 def _triangle_depth(ax, ay, az, bx, by, bz, cx, cy, cz, u, v, w, total):
-    # Depth where the ray meets a triangle that it is known to meet.
+    # Depth where the ray meets a triangle that its edge functions accept; inf if it does not.
     aa, bb, cc = ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy
     if abs(total) >= _EDGE_ON * max(aa, bb, cc):
         return (u * az + v * bz + w * cz) / total
@@ -168,8 +175,9 @@ def _piece_crossing(objects, piece, origins, ray, frame, near, far, once):
         if (su >= 0.0 and sv >= 0.0 and sw >= 0.0) or (su <= 0.0 and sv <= 0.0 and sw <= 0.0):
             total = u + v + w
             if total != 0.0:  # zero: seen exactly edge on, it hides nothing
-                t = sz * _triangle_depth(ax, ay, az, bx, by, bz, cx, cy, cz, u, v, w, total)
-                if near < t < far and t < best:
+                depth = _triangle_depth(ax, ay, az, bx, by, bz, cx, cy, cz, u, v, w, total)
+                t = sz * depth
+                if depth < math.inf and near < t < far and t < best:
                     best = t
         bx, by, bz, w = cx, cy, cz, -v
     return best

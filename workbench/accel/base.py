@@ -90,6 +90,11 @@ class Rays:
         return len(self.origins)
 
 
+def _own(array: NDArray, dtype: type = np.float64) -> NDArray:
+    # Contiguous and writable: numba compiles a kernel again for read-only arrays.
+    return np.require(array, dtype=dtype, requirements=["C", "W"])
+
+
 def as_skip_polygons(values: ArrayLike | None, count: int) -> IntArray:
     """Polygon indices as ``(count, 2)``; ``None`` skips nothing, one row serves all.
 
@@ -103,7 +108,7 @@ def as_skip_polygons(values: ArrayLike | None, count: int) -> IntArray:
         raise InputError(f"skip_polygons: found {array.dtype} values, expected integers")
     if array.ndim != 2 or array.shape[1] != 2 or array.shape[0] not in (1, count):
         raise InputError(f"skip_polygons: found shape {array.shape}, expected ({count}, 2)")
-    return np.ascontiguousarray(np.broadcast_to(array, (count, 2)), dtype=np.int64)
+    return _own(np.broadcast_to(array, (count, 2)), np.int64)
 
 
 def as_rays(
@@ -125,7 +130,7 @@ def as_rays(
         if 1 not in (len(start), len(along)):
             raise InputError(f"origins and directions: found {len(start)} and {len(along)} rows, expected as many")
         count = max(len(start), len(along)) if min(len(start), len(along)) else 0
-        start, along = (np.ascontiguousarray(np.broadcast_to(a, (count, 3))) for a in (start, along))
+        start, along = np.broadcast_to(start, (count, 3)), np.broadcast_to(along, (count, 3))
     still = ~along.any(axis=1)
     if still.any():
         raise InputError(f"directions: row {int(np.argmax(still))} has length zero")
@@ -135,4 +140,4 @@ def as_rays(
         raise InputError(f"far: found shape {np.shape(far)}, expected one value or ({len(start)},)") from None
     if not (limit >= 0.0).all():
         raise InputError(f"far: row {int(np.argmin(limit >= 0.0))} is negative or not a number")
-    return Rays(start, along, np.ascontiguousarray(limit), as_skip_polygons(skip_polygons, len(start)))
+    return Rays(_own(start), _own(along), _own(limit), as_skip_polygons(skip_polygons, len(start)))

@@ -504,8 +504,9 @@ def adaptive_linear_occlusion(
     least, most = levels
     if not 0 <= least <= most <= 16:
         raise InputError(f"levels: found {levels}, expected 0 <= least <= most <= 16")
-    if len(place) and (place[:, None] == lights).all(axis=2).any():
-        raise InputError("points: a point lies on an end of the light; move it off the light")
+    share = np.arange(2**most + 1)[:, None] / 2**most
+    if (place[:, None] == lights[:, :1] + share * (lights[:, 1:] - lights[:, :1])).all(axis=2).any():
+        raise InputError("points: a point lies on a sample of the light; move it off the light")
     run = _Run(grid, place, lights, skip_polygons, ids, workers, margin)
     occlusion = np.empty((len(place), run.bands))
     shots = np.empty(len(place), dtype=np.int64)
