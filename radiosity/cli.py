@@ -184,25 +184,26 @@ def _asked_before(settings: dict[str, Any], options: dict[str, Any]) -> dict[str
 
 def _save(solution: Solution, directory: Path, *, preview: bool, json_path: str | None) -> None:
     """Write the solution, then its picture, then the record that knows the seconds of both."""
+    from radiosity.view import solution_camera, write_preview
+
     record = solution.record
-    camera = solution.scene.camera
-    if camera is not None:
-        record.settings["camera"] = {
-            "eye": list(map(float, camera.eye)),
-            "look_at": list(map(float, camera.look_at)),
-            "up": list(map(float, camera.up)),
-            "fov_deg": float(camera.fov_deg),
-        }
+    camera = solution_camera(solution)
+    record.settings["camera"] = {
+        "eye": camera.eye.tolist(),
+        "look_at": camera.look_at.tolist(),
+        "up": camera.up.tolist(),
+        "fov_deg": float(camera.fov_deg),
+        "width": camera.width,
+        "height": camera.height,
+    }
     try:
         with record.stage("save"):
             solution.save(directory)
     except OSError as error:
         raise InputError(f"{directory}: the solution cannot be written: {error.strerror or error}") from None
     if preview:
-        from radiosity.view import write_preview
-
         with record.stage("preview"):
-            write_preview(solution, directory / "preview.png")
+            write_preview(solution, directory / "preview.png", camera=camera)
     record.write(directory / "record.json")
     if json_path is not None:
         record.write(json_path)

@@ -105,6 +105,13 @@ class PatchMesh:
         return np.searchsorted(self.piece_element, np.arange(self.element_count + 1)).astype(np.int64)
 
     @cached_property
+    def element_bounds(self) -> FloatArray:
+        """(n, 2, 3) float: box round each element."""
+        first = self.piece_start[self.element_piece[:-1]]
+        low, high = np.minimum.reduceat(self.corners, first), np.maximum.reduceat(self.corners, first)
+        return np.ascontiguousarray(np.stack([low, high], axis=1))
+
+    @cached_property
     def patch_area(self) -> FloatArray:
         """(q,) float: area of each patch, the sum of its elements'."""
         return np.add.reduceat(self.element_area, self.patch_start[:-1])
@@ -228,10 +235,11 @@ def _mesh_polygon(rings: list[FloatArray], pieces: list[FloatArray], edge: float
     xs = low[0] + extent[0] * np.linspace(0, 1, nu + 1)
     ys = low[1] + extent[1] * np.linspace(0, 1, nv + 1)
     boxes = shapely.box(*(a.ravel() for a in (*np.meshgrid(xs[:-1], ys[:-1]), *np.meshgrid(xs[1:], ys[1:]))))
+    cell = float(extent[0] * extent[1]) / (nu * nv)
     parts: list[list[FloatArray]] = []
     for cut in shapely.intersection(boxes, outline):
         for part in shapely.get_parts(cut):
-            if part.geom_type != "Polygon" or part.area <= 1e-12 * outline.area:
+            if part.geom_type != "Polygon" or part.area <= 1e-6 * cell:
                 continue
             part = shapely.geometry.polygon.orient(part)
             loops = [np.asarray(part.exterior.coords)[:-1]] + [np.asarray(r.coords)[:-1] for r in part.interiors]

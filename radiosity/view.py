@@ -37,6 +37,7 @@ __all__ = [
     "drawing_problem",
     "render_preview",
     "show",
+    "solution_camera",
     "window_problem",
     "write_preview",
     "write_screenshot",
@@ -164,13 +165,12 @@ def automatic_camera(mesh: PatchMesh, radiosity: NDArray[np.float64], *, up: int
     return cameras[int(np.argmax(shares))]
 
 
-def _scene_camera(solution: Solution) -> Camera:
+def solution_camera(solution: Solution) -> Camera:
     """The scene's own camera, or one found by :func:`automatic_camera`."""
     scene = solution.scene
-    if scene is not None and scene.camera is not None:
+    if scene.camera is not None:
         return scene.camera
-    path = getattr(scene, "path", None)
-    y_up = path is not None and Path(path).suffix.lower() in {".obj", ".glb", ".gltf"}
+    y_up = scene.path is not None and scene.path.suffix.lower() in {".obj", ".gz", ".glb", ".gltf"}
     return automatic_camera(solution.mesh, solution.radiosity, up=1 if y_up else 2)
 
 
@@ -196,9 +196,14 @@ def _white_level(luminance: NDArray[np.float64], emits: NDArray[np.bool_]) -> fl
 
 
 def render_preview(
-    solution: Solution, width: int | None = None, height: int | None = None, *, samples: int = 2
+    solution: Solution,
+    width: int | None = None,
+    height: int | None = None,
+    *,
+    camera: Camera | None = None,
+    samples: int = 2,
 ) -> NDArray[np.uint8]:
-    """The solution seen through the scene's camera, or through one found automatically.
+    """The solution seen through a camera, by default that of :func:`solution_camera`.
 
     Three bands are shown as red, green and blue; any other number as the sum over the bands with
     a colour bar.
@@ -208,6 +213,7 @@ def render_preview(
     solution : Solution
     width, height : int, optional
         Size of the picture; by default the camera's, at most :data:`PREVIEW_SIDE` a side. [pixels]
+    camera : Camera, optional
     samples : int
         Rays a pixel along each side.
 
@@ -217,7 +223,7 @@ def render_preview(
         sRGB, the top row first.
     """
     mesh = solution.mesh
-    camera = _scene_camera(solution)
+    camera = camera if camera is not None else solution_camera(solution)
     if width is None or height is None:
         scale = min(1.0, PREVIEW_SIDE / max(camera.width, camera.height))
         width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
@@ -239,8 +245,8 @@ def render_preview(
     if not colour:
         return _with_colour_bar(seen[:, 0], hit, white, mesh.emission.shape[1], camera, samples, bar)
     linear = np.minimum(seen / white, 1.0)
-    background = None if solution.scene is None else np.asarray(solution.scene.background)
-    if background is not None and background.any():
+    background = np.asarray(solution.scene.background)
+    if background.any():
         linear[~hit] = np.minimum(background * np.pi / white, 1.0)  # radiance to the same scale as radiosity
     else:
         linear[~hit] = _BACKGROUND
@@ -284,9 +290,9 @@ def _with_colour_bar(
     return np.ascontiguousarray(np.concatenate([picture, drawn], axis=1))
 
 
-def write_preview(solution: Solution, path: str | Path, *, width: int | None = None, height: int | None = None) -> None:
+def write_preview(solution: Solution, path: str | Path, *, camera: Camera | None = None) -> None:
     """Write :func:`render_preview` as a PNG file, whole or not at all."""
-    write_picture(path, render_preview(solution, width, height))
+    write_picture(path, render_preview(solution, camera=camera))
 
 
 # ---- pyvista ----------------------------------------------------------------------------------
@@ -347,7 +353,7 @@ def window_problem() -> str | None:
     return None
 
 
-def _plotter(directory: Path, field: str, *, off_screen: bool, size: tuple[int, int]) -> Any:
+def _plotter(directory: Path, field: str, *, off_screen: bool, size: tuple[int, int] | None) -> Any:
     """A pyvista plotter that holds one field of a saved solution."""
     if field not in FIELDS:
         raise OptionError(f"field: found {field!r}, expected one of {', '.join(FIELDS)}")
@@ -377,6 +383,18 @@ def _plotter(directory: Path, field: str, *, off_screen: bool, size: tuple[int, 
             values = values[:, 0]
     limits = [float(values.min()), float(values.max())] if len(values) else [0.0, 1.0]
     bar: dict[str, Any] = {}
+    scale_options = {
+        "title": title,
+        "color": "white",
+        "title_font_size": 18,
+        "label_font_size": 16,
+        "n_labels": 5,
+        "fmt": "%.4g",
+        "width": 0.7,
+        "height": 0.12,
+        "position_x": 0.15,
+        "position_y": 0.02,
+    }
     if field in ("radiosity_W_m2", "irradiance_W_m2", "unshot_W_m2"):
         # A lamp is far brighter than what it lights: the scale is for the latter, brighter is white.
         emission = np.asarray(mesh.cell_data["emission_W_m2"]).reshape(len(values), -1)
@@ -384,8 +402,12 @@ def _plotter(directory: Path, field: str, *, off_screen: bool, size: tuple[int, 
         top = float(np.percentile(dark, 99)) if len(dark) else 0.0
         if top > 0:
             limits, bar = [0.0, top], {"above_color": "white"}
+            scale_options["above_label"] = ""
     mesh.clear_data()
     mesh.cell_data["shown"] = values
+    camera = _recorded_camera(directory / "record.json")
+    if size is None:  # the camera's own shape, 900 pixels wide
+        size = (900, round(900 * camera["height"] / camera["width"]) if camera else 720)
     plotter: Any = pyvista.Plotter(off_screen=off_screen, window_size=list(size), title=f"{directory}: {title}")
     plotter.set_background("#40444a")
     plotter.add_mesh(
@@ -395,40 +417,32 @@ def _plotter(directory: Path, field: str, *, off_screen: bool, size: tuple[int, 
         cmap="inferno" if field.endswith("_W_m2") else "viridis",
         lighting=False,
         culling="back",
-        scalar_bar_args={
-            "title": title,
-            "color": "white",
-            "title_font_size": 18,
-            "label_font_size": 16,
-            "n_labels": 5,
-            "fmt": "%.4g",
-            "above_label": "",
-            "fill": True,  # a dark plate, so that the letters can be read over any surface
-            "background_color": "#202020",
-            "width": 0.7,
-            "height": 0.1,
-            "position_x": 0.15,
-            "position_y": 0.02,
-        },
+        scalar_bar_args=scale_options,
         **bar,
     )
-    _place_camera(plotter, directory / "record.json", mesh)
+    # A dark plate, so that the letters can be read over any surface; pyvista's own option draws it white.
+    scale = plotter.scalar_bars[title]
+    scale.SetDrawBackground(True)
+    scale.GetBackgroundProperty().SetColor(0.13, 0.13, 0.13)
+    if camera:
+        plotter.camera_position = [camera["eye"], camera["look_at"], camera["up"]]
+        plotter.camera.view_angle = camera["fov_deg"]
+        plotter.reset_camera_clipping_range()
+    else:
+        plotter.view_isometric()
     return plotter
 
 
-def _place_camera(plotter: Any, record: Path, mesh: Any) -> None:
-    """Look through the scene's camera, kept in the record, or from in front and above."""
+def _recorded_camera(record: Path) -> dict[str, Any] | None:
+    """The camera that the record keeps, or ``None``."""
     try:
-        camera = json.loads(record.read_text(encoding="utf-8"))["settings"]["camera"]
-        plotter.camera_position = [camera["eye"], camera["look_at"], camera["up"]]
-        plotter.camera.view_angle = float(camera["fov_deg"])
-        plotter.reset_camera_clipping_range()
-    except (OSError, ValueError, KeyError, TypeError):
-        plotter.view_isometric()
+        return json.loads(record.read_text(encoding="utf-8"))["settings"]["camera"]
+    except (OSError, ValueError, KeyError):
+        return None
 
 
 def write_screenshot(
-    directory: str | Path, path: str | Path, *, field: str = "radiosity_W_m2", size: tuple[int, int] = (900, 720)
+    directory: str | Path, path: str | Path, *, field: str = "radiosity_W_m2", size: tuple[int, int] | None = None
 ) -> None:
     """Draw one field of a saved solution with pyvista, off-screen, into a PNG file.
 
@@ -440,8 +454,8 @@ def write_screenshot(
         The picture; its name ends in ``.png``.
     field : str
         One of :data:`FIELDS`; of several bands the sum is shown, of reflectances the mean.
-    size : (width, height) int
-        [pixels]
+    size : (width, height) int, optional
+        By default 900 pixels wide, in the shape of the camera's picture. [pixels]
 
     Raises
     ------
@@ -482,4 +496,4 @@ def show(directory: str | Path, *, field: str = "radiosity_W_m2") -> None:
     problem = window_problem()
     if problem is not None:
         raise MissingLibraryError(f"no window can be opened: {problem}; draw into a file with --screenshot FILE.png")
-    _plotter(Path(directory), field, off_screen=False, size=(1200, 900)).show()
+    _plotter(Path(directory), field, off_screen=False, size=None).show()

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from radiosity.form_factors._sampling import place_on_pieces
 from radiosity.form_factors.analytic import pair_exchange
 from radiosity.patches import PatchMesh
 from workbench.accel.box_tree import BoxTree, boxes_meeting_planes
@@ -21,8 +22,13 @@ from workbench.culling.plane_vertex import CHECK_SLACK, light_pyramid, outside_p
 from workbench.culling.shaft import MAX_SHAFT_PLANES, box_shaft
 from workbench.geometry.flat import Geometry
 from workbench.geometry.lambert import lambert_piece
+from workbench.geometry.planes import newell_normal
 from workbench.shadow.area import MAX_CORNERS, MAX_PIECES, visible_share
 
+SAMPLES = 16
+"""Samples that stand for a cluster of facets from afar."""
+MAX_SENDER_PIECES = 4
+"""Convex pieces above which a patch is treated as a cluster."""
 MAX_CANDIDATES = 192
 """Longest candidate list handed down to a group; beyond it each point asks the tree itself."""
 
@@ -105,6 +111,10 @@ class MeshArrays(NamedTuple):
     patch_polygon: np.ndarray
     patch_bounds: np.ndarray
     patch_normal: np.ndarray
+    patch_area: np.ndarray
+    element_bounds: np.ndarray
+    samples: np.ndarray
+    sample_normals: np.ndarray
 
 
 class Workspace(NamedTuple):
@@ -113,6 +123,8 @@ class Workspace(NamedTuple):
     planes: np.ndarray
     shaft: np.ndarray
     found: np.ndarray
+    near: np.ndarray
+    box: np.ndarray
     picked: np.ndarray
     boxes: np.ndarray
     sizes: np.ndarray
@@ -142,6 +154,21 @@ def occluder_arrays(geometry: Geometry, tree: BoxTree) -> OccluderArrays:
     )
 
 
+def _patch_samples(mesh: PatchMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (q, SAMPLES, 3) that stand for equal parts of each cluster's area."""
+    points = np.zeros((mesh.patch_count, SAMPLES, 3))
+    normals = np.zeros_like(points)
+    for patch in np.flatnonzero(np.diff(mesh.patch_sender) > MAX_SENDER_PIECES).tolist():
+        first, last = mesh.patch_sender[patch], mesh.patch_sender[patch + 1]
+        for k in range(SAMPLES):
+            u, v = (k + 0.5) / SAMPLES, (k * 0.6180339887498949 + 0.5) % 1.0
+            piece = place_on_pieces(
+                mesh.sender_corners, mesh.sender_start, first, last, mesh.patch_area[patch], u, v, points[patch, k]
+            )
+            normals[patch, k] = mesh.sender_normal[piece]
+    return points, normals
+
+
 def mesh_arrays(mesh: PatchMesh) -> MeshArrays:
     """Gather the arrays of a mesh for the kernels."""
     return MeshArrays(
@@ -161,6 +188,9 @@ def mesh_arrays(mesh: PatchMesh) -> MeshArrays:
         mesh.patch_polygon,
         mesh.patch_bounds,
         mesh.patch_normal,
+        mesh.patch_area,
+        mesh.element_bounds,
+        *_patch_samples(mesh),
     )
 
 
@@ -171,6 +201,8 @@ def workspace(max_corners: int) -> Workspace:
         planes=np.empty((room + 2, 4)),
         shaft=np.empty((MAX_SHAFT_PLANES, 4)),
         found=np.empty(MAX_CANDIDATES, dtype=np.int64),
+        near=np.empty(MAX_CANDIDATES, dtype=np.int64),
+        box=np.empty((2, 3)),
         picked=np.empty(MAX_CANDIDATES, dtype=np.int64),
         boxes=np.empty((2, MAX_PIECES, MAX_CORNERS, 3)),
         sizes=np.zeros((2, MAX_PIECES), dtype=np.int64),
@@ -216,8 +248,8 @@ def _pick(candidates, many, own, other, piece_polygon, corners, starts, planes, 
 def _point_share(x, y, z, nx, ny, nz, own, geo, mesh, patch, found, count, limit, work, tally):
     """Form factor from a point to a patch; ``NEEDS_RAYS`` if more than ``limit`` candidates remain.
 
-    ``found[:count]`` are the group's candidates; a negative count sends the query to the tree.
-    Inlined: a call that hands on these tuples of arrays costs more than the work it does.
+    ``found[:count]`` are the group's candidates.  Inlined: a call that hands on these
+    tuples of arrays costs more than the work it does.
     """
     total = 0.0
     other = mesh.patch_polygon[patch]
@@ -231,19 +263,10 @@ def _point_share(x, y, z, nx, ny, nz, own, geo, mesh, patch, found, count, limit
         used = light_pyramid(
             x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, normal, 2.0 * geo.slack, work.planes
         )
-        candidates, many = found, count
-        if count < 0:
-            candidates = work.picked
-            many = boxes_meeting_planes(
-                geo.low, geo.high, geo.skip, geo.first, geo.count, geo.order, geo.bounds,
-                work.planes, used, geo.slack, work.picked, tally,
-            )  # fmt: skip
-        kept = MAX_CANDIDATES + 1
-        if many <= MAX_CANDIDATES:
-            kept = _pick(
-                candidates, many, own, other, geo.piece_polygon, geo.corners, geo.piece_start, work.planes, used,
-                geo.slack, limit, work.picked, tally,
-            )  # fmt: skip
+        kept = _pick(
+            found, count, own, other, geo.piece_polygon, geo.corners, geo.piece_start, work.planes, used,
+            geo.slack, limit, work.picked, tally,
+        )  # fmt: skip
         if kept == 0:
             tally[_CLEAR] += 1
             total += share
@@ -451,22 +474,102 @@ def _clear_rule(
     return total
 
 
+@njit(nogil=True, cache=True)
+def _extent(bounds, patch):
+    """Longest side of a patch's box."""
+    longest = 0.0
+    for axis in range(3):
+        longest = max(longest, bounds[patch, 1, axis] - bounds[patch, 0, axis])
+    return longest
+
+
+@njit(nogil=True, cache=True)
+def _sampled_share(centroids, normals, element, samples, sample_normals, patch, patch_area):
+    """Form factor from an element's centroid to a far cluster, by its samples.
+
+    Each stands for an equal part of the area, as a disk (Wallace, Elmquist and Haines 1989, eq. 7).
+    """
+    count = samples.shape[1]
+    part = patch_area / count
+    total = 0.0
+    for k in range(count):
+        square = facing = backing = 0.0
+        for axis in range(3):
+            d = samples[patch, k, axis] - centroids[element, axis]
+            square += d * d
+            facing += d * normals[element, axis]
+            backing -= d * sample_normals[patch, k, axis]
+        if facing > 0.0 and backing > 0.0:
+            total += facing * backing * part / (square * (math.pi * square + part))
+    return total
+
+
 @njit(nogil=True, cache=True, inline="always")
-def _clear_factor(element, patch, gap, geo, mesh, error, floor, exact, exact_wanted, work, tally):
+def _shaft_candidates(box, flat, normal, corner, own, patch, geo, mesh, found, work, tally):
+    """Pieces that may come between a box of receivers and a patch; -1 if there are too many.
+
+    ``normal`` and ``corner`` give the plane of ``flat`` receivers, ``own`` their polygon.
+    """
+    used = box_shaft(box[0], box[1], mesh.patch_bounds[patch, 0], mesh.patch_bounds[patch, 1], work.shaft)
+    flat_sender = mesh.patch_polygon[patch] >= 0
+    # A polygon behind or in the plane of either end blocks nothing between them.
+    if flat:
+        work.shaft[used, 0], work.shaft[used, 1], work.shaft[used, 2] = normal[0], normal[1], normal[2]
+        work.shaft[used, 3] = normal[0] * corner[0] + normal[1] * corner[1] + normal[2] * corner[2]
+        used += 1
+    if flat_sender:
+        n = mesh.patch_normal[patch]
+        c = mesh.sender_corners[mesh.sender_start[mesh.patch_sender[patch]]]
+        work.shaft[used, 0], work.shaft[used, 1], work.shaft[used, 2] = n[0], n[1], n[2]
+        work.shaft[used, 3] = n[0] * c[0] + n[1] * c[1] + n[2] * c[2]
+        used += 1
+    # A polygon that only touches the shaft from outside (the floor between two walls) meets a
+    # null set of segments: areas are integrated here, so the planes move inward by a hair.
+    for k in range(used):
+        work.shaft[k, 3] += 2.0 * geo.slack
+    many = boxes_meeting_planes(
+        geo.low, geo.high, geo.skip, geo.first, geo.count, geo.order, geo.bounds,
+        work.shaft, used, geo.slack, found, tally,
+    )  # fmt: skip
+    kept = -1
+    if many <= MAX_CANDIDATES:
+        kept = 0
+        for i in range(many):
+            piece = found[i]
+            polygon = geo.piece_polygon[piece]
+            if (flat and polygon == own) or (flat_sender and polygon == mesh.patch_polygon[patch]):
+                continue
+            tally[_STEST] += 1
+            if outside_planes(
+                geo.corners, geo.piece_start[piece], geo.piece_start[piece + 1], work.shaft, used, geo.slack
+            ):
+                tally[_SCULL] += 1
+                continue
+            found[kept] = piece
+            kept += 1
+    return kept
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _clear_factor(element, patch, gap, cluster, geo, mesh, error, floor, closed_forms, work, tally):
     """Unoccluded form factor from an element to a patch, and the estimate of its error.
 
     Far pairs: the element's 2 x 2 rule, whose error falls with the fourth power of size over
-    distance; nearer: 4 x 4; near and touching pairs: the closed form.  ``exact`` says that the
-    closed form may be used (the patch is one polygon or nothing stands between), ``exact_wanted`` that
-    it must be.
+    distance; nearer: 4 x 4; near and touching pairs (all, with ``closed_forms``): the closed form.
+    A cluster of many facets is a set of samples from afar, the sum over its facets from nearby.
     """
     area, size = mesh.area[element], mesh.size[element]
     reach = (0.05 / error) ** 0.25 * size
     value = doubt = 0.0
     tally[_CLOSED] += 1
-    closed = exact and (exact_wanted or gap < 0.5 * reach)
-    if not (exact and exact_wanted):
-        levels = 0 if closed or gap >= reach else 1
+    closed = not cluster and (closed_forms or gap < 0.5 * reach)
+    if cluster and gap > 2.0 * _extent(mesh.patch_bounds, patch):
+        share = _sampled_share(
+            mesh.centroid, mesh.normal, element, mesh.samples, mesh.sample_normals, patch, mesh.patch_area[patch]
+        )
+        value, doubt = share * area, 0.05 * share * area
+    elif not (closed and closed_forms):
+        levels = 0 if closed or cluster or gap >= reach else 1
         value = _clear_rule(
             mesh.corners, mesh.piece_start, mesh.element_piece[element], mesh.element_piece[element + 1], mesh.normal,
             element, mesh.sender_corners, mesh.sender_start, mesh.sender_normal, mesh.patch_sender[patch],
@@ -517,6 +620,58 @@ def _group_faces(q, patch, mesh, slack):
 
 
 @njit(nogil=True, cache=True)
+def _blocks_all(corners, a, b, ring_p, p0, p1, ring_q, q0, q1, slack):
+    """Whether one convex piece meets every segment between two convex polygons.
+
+    It is enough that it separates them and meets every segment between their corners: seen
+    through the piece's plane, the crossing of any segment is a convex combination of those.
+    """
+    vx, vy, vz = newell_normal(corners, a, b)
+    length = math.sqrt(vx * vx + vy * vy + vz * vz)
+    if length == 0.0:
+        return False
+    nx, ny, nz = vx / length, vy / length, vz / length
+    d = nx * corners[a, 0] + ny * corners[a, 1] + nz * corners[a, 2]
+    side = 0.0
+    for i in range(p0, p1):
+        off = nx * ring_p[i, 0] + ny * ring_p[i, 1] + nz * ring_p[i, 2] - d
+        if abs(off) <= slack or off * side < 0.0:
+            return False
+        side = off
+    for j in range(q0, q1):
+        off = nx * ring_q[j, 0] + ny * ring_q[j, 1] + nz * ring_q[j, 2] - d
+        if abs(off) <= slack or off * side > 0.0:
+            return False
+    for i in range(p0, p1):
+        px, py, pz = ring_p[i, 0], ring_p[i, 1], ring_p[i, 2]
+        dp = abs(nx * px + ny * py + nz * pz - d)
+        for j in range(q0, q1):
+            qx, qy, qz = ring_q[j, 0], ring_q[j, 1], ring_q[j, 2]
+            t = dp / (dp + abs(nx * qx + ny * qy + nz * qz - d))
+            x, y, z = px + t * (qx - px), py + t * (qy - py), pz + t * (qz - pz)
+            for k in range(a, b):
+                m = k + 1 if k + 1 < b else a
+                ex, ey, ez = corners[m, 0] - corners[k, 0], corners[m, 1] - corners[k, 1], corners[m, 2] - corners[k, 2]
+                wx, wy, wz = x - corners[k, 0], y - corners[k, 1], z - corners[k, 2]
+                turn = (ey * wz - ez * wy) * nx + (ez * wx - ex * wz) * ny + (ex * wy - ey * wx) * nz
+                if turn < 0.0:
+                    return False
+    return True
+
+
+@njit(nogil=True, cache=True)
+def _group_is_dark(geo_corners, starts, through, found, count, rings, p0, p1, q0, q1, slack):
+    """Whether some opaque candidate alone hides one convex polygon of ``rings`` from another."""
+    for i in range(count):
+        piece = found[i]
+        if through[piece] == 0.0 and _blocks_all(
+            geo_corners, starts[piece], starts[piece + 1], rings, p0, p1, rings, q0, q1, slack
+        ):
+            return True
+    return False
+
+
+@njit(nogil=True, cache=True)
 def shoot(
     patch, first, last, geo, mesh, limit, error, floor, levels, closed_forms, factor, spread, rays, work, tally
 ):  # fmt: skip
@@ -529,6 +684,7 @@ def shoot(
     """
     own_low, own_high = mesh.patch_bounds[patch, 0], mesh.patch_bounds[patch, 1]
     flat_sender = mesh.patch_polygon[patch] >= 0
+    cluster = mesh.patch_sender[patch + 1] - mesh.patch_sender[patch] > MAX_SENDER_PIECES
     for q in range(first, last):
         e0, e1 = mesh.patch_start[q], mesh.patch_start[q + 1]
         flat = mesh.patch_polygon[q] >= 0
@@ -540,52 +696,32 @@ def shoot(
             tally[_HORIZON] += e1 - e0
             continue
         # Shaft from the group to the patch; its candidates serve every element of the group.
-        used = box_shaft(mesh.patch_bounds[q, 0], mesh.patch_bounds[q, 1], own_low, own_high, work.shaft)
-        # A polygon that only touches the shaft from outside (the floor between two walls) meets a
-        # null set of segments: areas are integrated here, so the planes move inward by a hair.
-        for k in range(used):
-            work.shaft[k, 3] += 2.0 * geo.slack
-        # A polygon behind or in the plane of either end blocks nothing between them.
-        if flat:
-            n = mesh.patch_normal[q]
-            c = mesh.sender_corners[mesh.sender_start[mesh.patch_sender[q]]]
-            work.shaft[used, 0], work.shaft[used, 1], work.shaft[used, 2] = n[0], n[1], n[2]
-            work.shaft[used, 3] = n[0] * c[0] + n[1] * c[1] + n[2] * c[2] + 2.0 * geo.slack
-            used += 1
-        if flat_sender:
-            n = mesh.patch_normal[patch]
-            c = mesh.sender_corners[mesh.sender_start[mesh.patch_sender[patch]]]
-            work.shaft[used, 0], work.shaft[used, 1], work.shaft[used, 2] = n[0], n[1], n[2]
-            work.shaft[used, 3] = n[0] * c[0] + n[1] * c[1] + n[2] * c[2] + 2.0 * geo.slack
-            used += 1
-        tally[_SHAFT] += 1
-        many = boxes_meeting_planes(
-            geo.low, geo.high, geo.skip, geo.first, geo.count, geo.order, geo.bounds,
-            work.shaft, used, geo.slack, work.found, tally,
+        count = _shaft_candidates(
+            mesh.patch_bounds[q], flat, mesh.patch_normal[q], mesh.sender_corners[mesh.sender_start[mesh.patch_sender[q]]],
+            mesh.polygon[e0], patch, geo, mesh, work.found, work, tally,
         )  # fmt: skip
-        count = -1
-        if many <= MAX_CANDIDATES:
-            count = 0
-            for i in range(many):
-                piece = work.found[i]
-                polygon = geo.piece_polygon[piece]
-                if (flat and polygon == mesh.polygon[e0]) or (flat_sender and polygon == mesh.patch_polygon[patch]):
-                    continue
-                tally[_STEST] += 1
-                if outside_planes(
-                    geo.corners, geo.piece_start[piece], geo.piece_start[piece + 1], work.shaft, used, geo.slack
-                ):
-                    tally[_SCULL] += 1
-                    continue
-                work.found[count] = piece
-                count += 1
-            if count == 0:
-                tally[_EMPTY] += 1
+        tally[_SHAFT] += 1
+        if count == 0:
+            tally[_EMPTY] += 1
+        if count > 0:
+            # Both ends one convex polygon: one occluder may settle the whole group.
+            u, v = mesh.patch_sender[q], mesh.patch_sender[patch]
+            if (
+                flat and flat_sender
+                and mesh.patch_sender[q + 1] == u + 1 and mesh.patch_sender[patch + 1] == v + 1
+                and _group_is_dark(
+                    geo.corners, geo.piece_start, geo.through, work.found, count, mesh.sender_corners,
+                    mesh.sender_start[u], mesh.sender_start[u + 1], mesh.sender_start[v], mesh.sender_start[v + 1],
+                    geo.slack,
+                )
+            ):  # fmt: skip
+                tally[_DARK] += e1 - e0
+                continue
         for e in range(e0, e1):
             gap = _box_distance(mesh.centroid, e, mesh.patch_bounds, patch)
             area = mesh.area[e]
             open_factor, doubt = _clear_factor(
-                e, patch, gap, geo, mesh, error, floor, flat_sender or count == 0, closed_forms, work, tally
+                e, patch, gap, cluster, geo, mesh, error, floor, closed_forms, work, tally
             )
             if open_factor <= 0.0:
                 tally[_HORIZON] += 1
@@ -595,13 +731,40 @@ def shoot(
                 factor[e] = open_factor
                 spread[e] = doubt
                 continue
+            candidates, many = work.found, count
+            if cluster:
+                factor[e] = open_factor
+                rays[e] = True
+                tally[_COMPLEX] += 1
+                continue
+            if count < 0 or count > 2 * limit:
+                # Long list: the shaft of this element alone may be empty, or short enough to cut.
+                for axis in range(3):
+                    work.box[0, axis] = mesh.element_bounds[e, 0, axis]
+                    work.box[1, axis] = mesh.element_bounds[e, 1, axis]
+                many = _shaft_candidates(
+                    work.box, True, mesh.normal[e], mesh.corners[mesh.piece_start[mesh.element_piece[e]]],
+                    mesh.polygon[e], patch, geo, mesh, work.near, work, tally,
+                )  # fmt: skip
+                tally[_SHAFT] += 1
+                candidates = work.near
+                if many == 0:
+                    tally[_EMPTY] += 1
+                    factor[e] = open_factor
+                    spread[e] = doubt
+                    continue
+                if many < 0 or many > 4 * limit:
+                    factor[e] = open_factor
+                    rays[e] = True
+                    tally[_COMPLEX] += 1
+                    continue
             allowed = (error * open_factor + floor) * area
             own = mesh.polygon[e]
             depth = levels
             if open_factor < floor:
                 depth = 0  # too faint to be worth a second look
             value, doubt = element_integral(
-                e, patch, geo, mesh, work.found, count, limit, allowed, depth, own, work, tally
+                e, patch, geo, mesh, candidates, many, limit, allowed, depth, own, work, tally
             )
             if value < 0.0:
                 factor[e] = open_factor
@@ -610,6 +773,10 @@ def shoot(
                 # Rounding or a rule's error may not lift a part above the whole.
                 factor[e] = min(value / area, open_factor)
                 spread[e] = doubt / area
+                if depth == 0:
+                    # One rule of four points and no second look: the doubt of four samples.
+                    share = factor[e] / open_factor
+                    spread[e] = 0.5 * open_factor * math.sqrt(share * (1.0 - share))
 
 
 @njit(nogil=True, cache=True)

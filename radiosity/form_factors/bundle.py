@@ -29,6 +29,7 @@ from radiosity.form_factors._links import (
     shoot,
     workspace,
 )
+from radiosity.form_factors._sampling import place_on_pieces, stream
 from radiosity.patches import PatchMesh
 from workbench.accel.box_tree import BoxTree
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
@@ -36,7 +37,7 @@ from workbench.counters import Counters
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
 
-__all__ = ["Columns", "LinkSettings", "ReceiverBundles", "place_on_pieces", "stream"]
+__all__ = ["Columns", "LinkSettings", "ReceiverBundles"]
 
 FloatArray = NDArray[np.float64]
 
@@ -102,53 +103,20 @@ class Columns:
 _G4 = 1.1673039782614187
 
 
-@njit(nogil=True, cache=True, inline="always")
-def stream(a, b, seed):
-    """SplitMix64 of three integers: an independent stream for each element, patch and seed."""
-    h = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15)
-    h ^= np.uint64(b) * np.uint64(0xBF58476D1CE4E5B9) + np.uint64(seed) * np.uint64(0x94D049BB133111EB)
-    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return h ^ (h >> np.uint64(31))
-
-
 @njit(nogil=True, cache=True)
-def place_on_pieces(corners, starts, first, last, total, u, v, out):
-    """Point of the pieces ``first..last`` at (u, v), uniform by area; returns its piece."""
-    goal = u * total
-    for piece in range(first, last):
-        a, b = starts[piece], starts[piece + 1]
-        for k in range(a + 1, b - 1):
-            e0, e1, e2 = corners[k, 0] - corners[a, 0], corners[k, 1] - corners[a, 1], corners[k, 2] - corners[a, 2]
-            f0, f1, f2 = (
-                corners[k + 1, 0] - corners[a, 0],
-                corners[k + 1, 1] - corners[a, 1],
-                corners[k + 1, 2] - corners[a, 2],
-            )
-            c0, c1, c2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
-            area = 0.5 * math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
-            if goal <= area or (piece == last - 1 and k == b - 2):
-                s = math.sqrt(min(max(goal / area, 0.0), 1.0)) if area > 0.0 else 0.0
-                # Uniform on a triangle: distance from the first corner by sqrt, across by v.
-                p, q = s * (1.0 - v), s * v
-                out[0] = corners[a, 0] + p * e0 + q * f0
-                out[1] = corners[a, 1] + p * e1 + q * f1
-                out[2] = corners[a, 2] + p * e2 + q * f2
-                return piece
-            goal -= area
-    return last - 1
-
-
-@njit(nogil=True, cache=True)
-def _bundle_rays(elements, patch, patch_area, count, seed, mesh, offset, centre, scale, origins, directions, weights):
+def _bundle_rays(
+    elements, counts, patch, patch_area, seed, mesh, offset, centre, scale, starts, origins, directions, weights
+):  # fmt: skip
     """Rays from random points of elements to random points of a patch, in Embree's unit frame.
 
-    ``weights`` gets the kernel cos cos / r^2 of each ray; 0 for a pair that does not face.
+    Element ``i`` tries ``counts[i]`` pairs; those that face each other become rays
+    ``starts[i]:starts[i + 1]`` with the kernel cos cos / r^2 as weight.  Returns the number of rays.
     """
     x, y = np.empty(3), np.empty(3)
     g1, g2, g3, g4 = 1.0 / _G4, 1.0 / _G4**2, 1.0 / _G4**3, 1.0 / _G4**4
     row = 0
     for i in range(elements.shape[0]):
+        starts[i] = row
         e = elements[i]
         h = stream(e, patch, seed)
         s1 = np.float64(h & np.uint64(0xFFFF)) / 65536.0
@@ -156,7 +124,7 @@ def _bundle_rays(elements, patch, patch_area, count, seed, mesh, offset, centre,
         s3 = np.float64((h >> np.uint64(32)) & np.uint64(0xFFFF)) / 65536.0
         s4 = np.float64((h >> np.uint64(48)) & np.uint64(0xFFFF)) / 65536.0
         n = mesh.normal[e]
-        for k in range(count):
+        for k in range(counts[i]):
             t = k + 0.5
             place_on_pieces(
                 mesh.corners, mesh.piece_start, mesh.element_piece[e], mesh.element_piece[e + 1], mesh.area[e],
@@ -173,30 +141,36 @@ def _bundle_rays(elements, patch, patch_area, count, seed, mesh, offset, centre,
                 cx += d * n[axis]
                 cy -= d * m[axis]
                 square += d * d
+            if cx <= 0.0 or cy <= 0.0:
+                continue
+            weights[row] = cx * cy / (square * square)
+            for axis in range(3):
                 start = x[axis] + offset * n[axis]
                 origins[row, axis] = (start - centre[axis]) * scale
                 directions[row, axis] = (y[axis] + offset * m[axis] - start) * scale
-            weights[row] = cx * cy / (square * square) if cx > 0.0 and cy > 0.0 and square > 0.0 else 0.0
             row += 1
+    starts[elements.shape[0]] = row
+    return row
 
 
 @njit(nogil=True, cache=True)
-def _apply_shares(elements, count, weights, blocked, factor, spread):
+def _apply_shares(elements, starts, weights, blocked, factor, spread):
     """Scale the unoccluded form factors by the weighted visible share; set the standard error."""
     for i in range(elements.shape[0]):
         e = elements[i]
         total = seen = square = 0.0
-        for k in range(i * count, (i + 1) * count):
+        for k in range(starts[i], starts[i + 1]):
             w = weights[k]
             total += w
             square += w * w
             if not blocked[k]:
                 seen += w
         if total <= 0.0:
-            spread[e] = factor[e]  # no ray could tell: the whole is in doubt
+            # No pair faced the other: what little is seen is in doubt as a whole.
+            spread[e] = factor[e]
             continue
         share = seen / total
-        # One of (effective count + 2) pseudo-rays, so that agreeing rays still leave a doubt.
+        # Two pseudo-rays, one of each kind, so that agreeing rays still leave a doubt.
         effective = total * total / square
         safe = (share * effective + 1.0) / (effective + 2.0)
         spread[e] = factor[e] * math.sqrt(safe * (1.0 - safe) / (effective + 2.0))
@@ -233,8 +207,12 @@ class ReceiverBundles:
         """Stop the threads."""
         self._pool.shutdown()
 
-    def columns(self, patches: Sequence[int] | NDArray[np.int64]) -> Columns:
-        """Form factors from all elements to each of ``patches``."""
+    def columns(self, patches: Sequence[int] | NDArray[np.int64], floors: FloatArray | None = None) -> Columns:
+        """Form factors from all elements to each of ``patches``.
+
+        ``floors`` (k,) raises the absolute error below which a patch's form factors are not
+        refined: faint patches need less care than bright ones.
+        """
         chosen = np.asarray(patches, dtype=np.int64)
         n = self.mesh.element_count
         factor, spread = np.zeros((len(chosen), n)), np.zeros((len(chosen), n))
@@ -246,6 +224,7 @@ class ReceiverBundles:
             for first in range(0, groups, GROUPS_A_TASK)
         ]
         settings = self.settings
+        lowest = np.full(len(chosen), self._floor) if floors is None else np.maximum(floors, self._floor)
 
         def settle(task: tuple[int, int, int]) -> tuple[NDArray, float, int]:
             row, first, last = task
@@ -254,38 +233,45 @@ class ReceiverBundles:
             try:
                 shoot(
                     int(chosen[row]), first, last, self._geo, self._mesh, settings.candidates, settings.error,
-                    self._floor, settings.levels, settings.closed_forms, factor[row], spread[row], rays[row],
+                    lowest[row], settings.levels, settings.closed_forms, factor[row], spread[row], rays[row],
                     work, tally,
                 )  # fmt: skip
             finally:
                 self._idle.append(work)
             a, b = self.mesh.patch_start[first], self.mesh.patch_start[last]
             doubtful = a + np.flatnonzero(rays[row, a:b])
-            seconds = self._trace(int(chosen[row]), doubtful, factor[row], spread[row])
-            return tally, seconds, len(doubtful) * settings.rays
+            # What is too faint to matter gets a quarter of the rays.
+            faint = factor[row, doubtful] < lowest[row]
+            counts = np.where(faint, max(1, settings.rays // 4), settings.rays)
+            traced, seconds = self._trace(int(chosen[row]), doubtful, counts, factor[row], spread[row])
+            return tally, seconds, traced
 
         for tally, seconds, traced in self._pool.map(settle, tasks):
             self.counters.add(**dict(zip(TALLY, tally.tolist(), strict=True)), rays=traced)
             self.seconds_in_embree += seconds
         return Columns(chosen, factor, spread)
 
-    def _trace(self, patch: int, elements: NDArray[np.int64], factor: FloatArray, spread: FloatArray) -> float:
-        """Scale the flagged form factors by rays, block by block; seconds spent inside Embree."""
-        count = self.settings.rays
-        step = max(1, BLOCK_RAYS // count)
+    def _trace(
+        self, patch: int, elements: NDArray[np.int64], counts: NDArray[np.int64], factor: FloatArray, spread: FloatArray
+    ) -> tuple[int, float]:
+        """Scale the flagged form factors by rays, block by block; rays traced, seconds in Embree."""
+        step = max(1, BLOCK_RAYS // self.settings.rays)
         centre, scale = self.accelerator.frame
-        seconds = 0.0
-        for start in range(0, len(elements), step):
-            block = elements[start : start + step]
-            origins = np.empty((len(block) * count, 3), dtype=np.float32)
+        seconds, traced = 0.0, 0
+        for begin in range(0, len(elements), step):
+            block = slice(begin, begin + step)
+            most = int(counts[block].sum())
+            starts = np.empty(len(elements[block]) + 1, dtype=np.int64)
+            origins = np.empty((most, 3), dtype=np.float32)
             directions = np.empty_like(origins)
-            weights = np.empty(len(origins))
-            _bundle_rays(
-                block, patch, float(self.mesh.patch_area[patch]), count, self.settings.seed, self._mesh,
-                self.accelerator.offset, centre, scale, origins, directions, weights,
+            weights = np.empty(most)
+            used = _bundle_rays(
+                elements[block], counts[block], patch, float(self.mesh.patch_area[patch]), self.settings.seed,
+                self._mesh, self.accelerator.offset, centre, scale, starts, origins, directions, weights,
             )  # fmt: skip
-            begin = time.perf_counter()
-            blocked = self.accelerator.blocked_unit(origins, directions, np.ones(len(origins), dtype=np.float32))
-            seconds += time.perf_counter() - begin
-            _apply_shares(block, count, weights, blocked, factor, spread)
-        return seconds
+            clock = time.perf_counter()
+            blocked = self.accelerator.blocked_unit(origins[:used], directions[:used], np.ones(used, dtype=np.float32))
+            seconds += time.perf_counter() - clock
+            traced += used
+            _apply_shares(elements[block], starts, weights, blocked, factor, spread)
+        return traced, seconds

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from radiosity.form_factors.bundle import place_on_pieces, stream
+from radiosity.form_factors._sampling import place_on_pieces, stream
 from radiosity.patches import PatchMesh
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
 from workbench.scene.model import Light, Scene

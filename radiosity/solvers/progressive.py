@@ -33,6 +33,8 @@ BATCH_SHARE = 0.25
 """A patch joins the batch if it has this share of the largest unshot power."""
 SOLVE_LIMIT = 3000
 """Most patches whose last bounces are solved at once."""
+FLOOR_SHARE = 0.1
+"""Share of the wanted error that one patch may bring to an irradiance."""
 CACHE_SHARE = 0.25
 """Share of the free memory that kept form factors may take."""
 
@@ -97,6 +99,19 @@ def _solve_rest(solution: Solution, cache: dict[int, FloatArray]) -> None:
     solution.unshot[:] = 0.0
 
 
+def _floors(solution: Solution, patches: IntArray, error: float) -> FloatArray:
+    """Form-factor error that matters for each patch: a share of the light there is, over its own.
+
+    An error dF of a form factor changes an irradiance by ``dF * B``: of the contribution B F A that
+    hierarchical radiosity refines by (P. Hanrahan, D. Salzman and L. Aupperle 1991), A is common to all.
+    """
+    mesh, book = solution.mesh, solution.book
+    mean = np.maximum(book.received, book.emitted) / mesh.element_area.sum()
+    sent = mesh.patch_mean(solution.unshot)[patches]
+    share = np.divide(sent, mean, out=np.zeros_like(sent), where=mean > 0).max(axis=1)
+    return FLOOR_SHARE * error / np.maximum(share, 1e-12)
+
+
 def shoot_until(
     solution: Solution,
     bundles: ReceiverBundles,
@@ -148,7 +163,7 @@ def shoot_until(
             rows = {p: cache[p] for p in batch.tolist() if p in cache}
             if len(fresh):
                 with record.stage("form factors"):
-                    columns = bundles.columns(fresh)
+                    columns = bundles.columns(fresh, _floors(solution, fresh, bundles.settings.error))
                 for row, patch in enumerate(fresh.tolist()):
                     rows[patch] = columns.factor[row]
                     if len(cache) < room:
