@@ -264,7 +264,7 @@ def _progress() -> Iterator[Any]:
 
     Yields the function that the solver calls with a ``ProgressEvent``.  After the first Ctrl-C its
     next call raises ``KeyboardInterrupt``, which the solver answers with the solution so far; a
-    second Ctrl-C raises it wherever the program is.
+    second Ctrl-C ends the process.
     """
     from tqdm import tqdm
 
@@ -272,8 +272,10 @@ def _progress() -> Iterator[Any]:
 
     def on_interrupt(number: int, frame: Any) -> None:
         nonlocal asked
+        if asked:  # threads inside a kernel would keep an exception from ending the process
+            os.write(2, b"\nradiosity: quit; nothing was written\n")
+            os._exit(INTERRUPTED)
         asked = True
-        signal.signal(signal.SIGINT, before)
         os.write(2, b"\nradiosity: stopping after this step; press Ctrl-C again to quit at once\n")
 
     before = signal.signal(signal.SIGINT, on_interrupt)

@@ -71,7 +71,7 @@ def run(*arguments):
 
 
 def solve(scene, directory, *options):
-    return run("solve", scene, "-o", directory, "--elements", 60, "--rays", 4, *options)
+    return run("solve", scene, "-o", directory, "--elements", 150, "--method", "progressive", *options)
 
 
 def refused(result, pattern):
