@@ -23,6 +23,7 @@ NOTHING = np.zeros(3)
 BLACK = Material("black", NOTHING, NOTHING, NOTHING, np.inf, NOTHING)
 LIGHT = np.array([[-0.5, -0.5, 2], [-0.5, 0.5, 2], [0.5, 0.5, 2], [0.5, -0.5, 2]])
 UP = np.array([0.0, 0.0, 1.0])
+MODES = ["naive", "optimised"]
 TRUTH = Path(__file__).resolve().parents[2] / ".." / "shared" / "truth" / "truth.json"
 
 
@@ -179,7 +180,7 @@ def test_6_4_a_strip_between_two_columns_of_pixels():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("mode", ["naive", "optimised"])
+@pytest.mark.parametrize("mode", MODES)
 def test_6_5_overdraw_counts_once(backend, mode):
     # Two quads hide the same 0.3 of the light: 6 columns of 20.
     low, high = square(-1, -0.1, -1, 1, 1), square(-2, -0.15, -2, 2, 1.5)
@@ -193,7 +194,7 @@ def test_6_5_overdraw_counts_once(backend, mode):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("mode", ["naive", "optimised"])
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     "occluder",
     [
@@ -260,7 +261,7 @@ def test_6_9_the_light_is_clipped_at_the_horizon(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("mode", ["naive", "optimised"])
+@pytest.mark.parametrize("mode", MODES)
 def test_6_10_the_light_and_its_housing_do_not_shade_it(backend, mode):
     housing = [LIGHT, LIGHT[::-1], square(-1, 1, -1, 1, 2), square(-1, 1, -1, 1, 2.001), square(-5, 5, -5, 5, 2.5)]
     points = np.random.default_rng(3).uniform([-2, -2, -0.5], [2, 2, 0.5], (100, 3))
@@ -318,6 +319,10 @@ def test_6_11_a_light_that_is_not_flat(backend):
     # A plate through the ball's middle, wider than it, hides nothing of the near side.
     plate = look([0, 0, 0], UP, light, geometry_of(square(-2, 2, -2, 2, 2.001)), viewport=64, backend=backend)
     assert plate.visible_share[0] == 1.0
+    # One close before the ball's limb hides a little of it, and the far plane does not drop it.
+    limb = geometry_of(square(0.4, 9, -9, 9, 1.75))
+    shares = [look([0, 0, 0], UP, light, limb, mode=mode, backend=backend).visible_share[0] for mode in MODES]
+    assert 0.9 < shares[0] == shares[1] < 1.0
     # Inside the ball all facets are seen from behind; a dome down to the horizon fits no viewport.
     assert look([0, 0, 2], UP, light, geometry_of(wall)).state[0] == CameraState.UNLIT
     dome = [facet[::-1] for facet in light]
@@ -389,10 +394,7 @@ def test_naive_and_optimised_cameras_agree_bit_for_bit(jitter, backend):
     renders = np.zeros(2)
     for seed in range(12):
         points, light, geometry = random_case(seed)
-        naive, quick = (
-            look(points, UP, light, geometry, mode=mode, jitter=jitter, backend=backend)
-            for mode in ("naive", "optimised")
-        )
+        naive, quick = (look(points, UP, light, geometry, mode=mode, jitter=jitter, backend=backend) for mode in MODES)
         assert np.array_equal(naive.visible_share, quick.visible_share, equal_nan=True)
         assert np.array_equal(naive.pixel_fraction, quick.pixel_fraction, equal_nan=True)
         assert (naive.visible_share[quick.state == CameraState.NOT_INSHADOW] == 1).all()
@@ -407,6 +409,10 @@ def test_a_convex_occluder_before_the_whole_light_is_known_dark():
         seen = look(points, UP, light, geometry_of(square(-0.5, 0.5, -0.5, 0.5, 1)))
         assert seen.state.tolist() == [CameraState.INSHADOW, CameraState.RENDERED, CameraState.NOT_INSHADOW]
         assert seen.counters["inshadow"] == seen.counters["not_inshadow"] == seen.counters["complex_shadow"] + 1 == 1
+    # A plate that covers the whole view but dives behind the light half way hides half of it.
+    tilted = geometry_of([[-5, -5, 1], [5, -5, 3], [5, 5, 3], [-5, 5, 1]])
+    half = look([0, 0, 0], UP, LIGHT, tilted)
+    assert half.state[0] == CameraState.RENDERED and half.visible_share[0] == pytest.approx(0.5)
 
 
 @pytest.mark.skipif(not has_gl(), reason="no OpenGL on EGL here")
