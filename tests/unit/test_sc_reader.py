@@ -394,6 +394,7 @@ def test_scene_for_radiosity(tmp_path):
     np.testing.assert_allclose(wall.material.transmittance, 0.2)
     np.testing.assert_allclose(lamp.material.emission, [1, 2, 3])
     np.testing.assert_allclose(scene.background, [0.1, 0.2, 0.3])
+    assert [note.split()[0] for note in scene.notes] == ["spheres", "point"]
     light = scene.lights[0]
     assert (light.kind, light.position.tolist(), light.power.tolist()) == ("point", [1, 2, 3], [4, 5, 6])
     assert ball.sphere.radius == 2 and ball.sphere.center.tolist() == [1, 1, 1]

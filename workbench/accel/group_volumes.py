@@ -268,7 +268,7 @@ class GroupVolumes:
             self._bsphere + grow * (0, 0, 0, 1), self._bbox + grow * (-1, -1, -1, 1, 1, 1),
             t, primitive, counts,
         )  # fmt: skip
-        sphere_tests, polygon_tests, bsphere_tests, bbox_tests = counts
+        sphere_tests, polygon_tests, bsphere_tests, bbox_tests = (int(count) for count in counts)
         return Hits(t, primitive), Counters(
             rays=len(rays),
             rays_hit=int((primitive >= 0).sum()),

@@ -153,11 +153,11 @@ def cone_mesh(
     here = np.arange(count)
     after = (here + 1) % count
     if apex_radius == 0:
-        columns = (here, after, here + count)
+        columns = [here, after, here + count]
     elif base_radius == 0:
-        columns = (here, after + count, here + count)
+        columns = [here, after + count, here + count]
     else:
-        columns = (here, after, after + count, here + count)
+        columns = [here, after, after + count, here + count]
     sagitta = max(base_radius, apex_radius) * (1 - np.cos(np.pi / count))
     return (
         np.concatenate([low, high]),

@@ -20,6 +20,7 @@ from workbench.arrays import as_points, as_unit_vectors
 from workbench.counters import Counters
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
+from workbench.memory import require_memory
 from workbench.render.camera import PinholeRays
 from workbench.render.shading import phong, turn_toward
 from workbench.scene.model import Material, Scene, Surface
@@ -244,8 +245,15 @@ class RayCaster:
         ----------
         progress : callable, optional
             Called now and then with the share of the picture that is done.
+
+        Raises
+        ------
+        MemoryForecastError
+            If the picture needs more memory than is free.
         """
         width, height = self.rays.width, self.rays.height
+        # 24 bytes of radiance, 8 of primitive, 3 and some for the file.
+        require_memory(40 * width * height, f"a picture of {width} x {height}", "ask for a smaller one")
         radiance = np.empty((height, width, 3))
         primitive = np.empty((height, width), dtype=np.int64)
         own_threads = getattr(self._accelerator, "own_threads", False)

@@ -18,7 +18,7 @@ __all__ = ["main"]
 class _OneLineErrors(click.Command):
     """A command that ends bad input with one line on standard error and exit code 2."""
 
-    def main(self, *args: Any, **kwargs: Any) -> Any:  # type: ignore[override]
+    def main(self, *args: Any, **kwargs: Any) -> Any:
         kwargs["standalone_mode"] = False
         try:
             sys.exit(super().main(*args, **kwargs))

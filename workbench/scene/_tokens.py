@@ -9,10 +9,11 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.errors import InputError, SceneError
-from workbench.geometry.polygons import check_polygon, convex_pieces, is_convex, vector_area
+from workbench.errors import SceneError
+from workbench.geometry.polygons import check_polygon, is_convex, vector_area
+from workbench.scene.library import polygon_fault
 
-__all__ = ["Words", "polygon_fault", "read_text"]
+__all__ = ["Words", "read_text", "ring_fault"]
 
 LARGEST = 1e60
 """Largest coordinate that a reader takes: four of them multiplied still fit a double."""
@@ -128,15 +129,15 @@ class Words:
         return _quote(word)
 
 
-def polygon_fault(ring: NDArray[np.float64]) -> str | None:
-    """What is wrong with a ring (n, 3), in a few words, or ``None``: flat, with an area, not self-crossing."""
+def ring_fault(ring: NDArray[np.float64]) -> str | None:
+    """What is wrong with a ring (n, 3), in a few words, or ``None``: flat, with an area, not self-crossing.
+
+    The slow tests are kept for rings that are not convex.
+    """
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         fault = check_polygon([ring])
         if fault is None and len(ring) > 3:
             vector = vector_area(ring)
             if not is_convex(ring, vector / np.linalg.norm(vector)):
-                try:
-                    convex_pieces([ring])
-                except InputError as error:
-                    fault = str(error)
+                fault = polygon_fault([ring])
     return fault

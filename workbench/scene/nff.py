@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.errors import SceneError
-from workbench.geometry.tessellation import cone_mesh, sphere_mesh
-from workbench.scene._tokens import LARGEST_SIDE, Words, polygon_fault, read_text
-from workbench.scene.model import Camera, Light, Material, Scene, Sphere, Surface
+from workbench.geometry.tessellation import cone_mesh
+from workbench.scene._tokens import LARGEST_SIDE, Words, read_text, ring_fault
+from workbench.scene.library import sphere_surface
+from workbench.scene.model import Camera, Light, Material, Scene, Surface
 
 __all__ = [
     "NffCone",
@@ -150,7 +151,7 @@ def _read_polygon(words: Words, patch: bool, fill: int) -> NffPolygon:
     count = words.integer("the number of vertices", 3, 10**6)
     rows = words.points(count, 6 if patch else 3, "vertex")
     vertices = np.ascontiguousarray(rows[:, :3])
-    fault = polygon_fault(vertices)
+    fault = ring_fault(vertices)
     if fault is not None:
         words.fail(f"found {fault}, expected a flat simple polygon", line)
     if not patch:
@@ -250,7 +251,7 @@ def _material(fill: NffFill, index: int, scene: NffScene, line: int) -> Material
 
 def _patch_surface(name: str, material: Material, patches: list[NffPolygon]) -> Surface:
     """Patches as one smooth surface: vertices at the same place with the same normal are shared."""
-    rows = np.concatenate([np.column_stack([patch.vertices, patch.normals]) for patch in patches])
+    rows = np.concatenate([np.hstack([p.vertices, p.normals]) for p in patches if p.normals is not None])
     shared, index = np.unique(rows, axis=0, return_inverse=True)
     offsets = np.concatenate([[0], np.cumsum([len(patch.vertices) for patch in patches])]).astype(np.int64)
     return Surface(
@@ -267,20 +268,19 @@ def _patch_surface(name: str, material: Material, patches: list[NffPolygon]) -> 
 def _round_surface(name: str, material: Material, thing: NffSphere | NffCone, facet_error: float) -> Surface:
     """A sphere, cone or cylinder as facets."""
     if isinstance(thing, NffSphere):
-        inside = thing.radius < 0
-        vertices, faces, normals, distance = sphere_mesh(thing.center, abs(thing.radius), facet_error)
-    else:
-        inside = min(thing.base_radius, thing.apex_radius) < 0
-        vertices, faces, normals, distance = cone_mesh(
-            thing.base, abs(thing.base_radius), thing.apex, abs(thing.apex_radius), facet_error
+        return sphere_surface(
+            name, material, thing.center, abs(thing.radius), facet_error=facet_error, inward=thing.radius < 0
         )
+    inside = min(thing.base_radius, thing.apex_radius) < 0
+    vertices, faces, normals, distance = cone_mesh(
+        thing.base, abs(thing.base_radius), thing.apex, abs(thing.apex_radius), facet_error
+    )
     return Surface.from_mesh(
         name,
         material,
         vertices,
         faces[:, ::-1] if inside else faces,
         vertex_normals=-normals if inside else normals,
-        sphere=Sphere(thing.center, abs(thing.radius)) if isinstance(thing, NffSphere) else None,
         facet_error=distance,
     )
 
@@ -341,4 +341,7 @@ def load_scene(path: str | Path, *, facet_error: float = 0.02) -> Scene:
         camera=Camera(view.eye, view.at, view.up, view.angle_deg, view.width, view.height),
         background=source.background,
         path=source.path,
+        notes=(f"spheres, cones and cylinders are facets that lie within {facet_error:g} of their radius",)
+        if any(not isinstance(thing, NffPolygon) for thing in source.objects)
+        else (),
     )

@@ -34,9 +34,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.errors import SceneError
-from workbench.geometry.tessellation import sphere_mesh
-from workbench.scene._tokens import LARGEST, LARGEST_SIDE, Words, polygon_fault, read_text
-from workbench.scene.model import Camera, Light, Material, Scene, Sphere, Surface
+from workbench.scene._tokens import LARGEST, LARGEST_SIDE, Words, read_text, ring_fault
+from workbench.scene.library import sphere_surface
+from workbench.scene.model import Camera, Light, Material, Scene, Surface
 
 __all__ = [
     "ScGroup",
@@ -438,7 +438,7 @@ class _Reader:
         vertices = self._to_world(words.points(count, 3, "vertex"), words, line)
         if self._mirrors():
             vertices = vertices[::-1]
-        fault = polygon_fault(vertices)
+        fault = ring_fault(vertices)
         if fault is not None:
             words.fail(f"found {fault}, expected a flat simple polygon", line)
         self.primitives.append(ScPolygon(np.ascontiguousarray(vertices), self.material, self.group, line))
@@ -506,7 +506,8 @@ def _camera(scene: ScScene) -> Camera:
     """
     linear = np.linalg.inv(scene.world_to_eye[:3, :3])
     gram = linear.T @ linear
-    square = np.trace(gram) / 3
+    square = float(np.trace(gram)) / 3
+    scale = math.sqrt(square)
     if np.abs(gram - square * np.eye(3)).max() > 1e-6 * square or np.linalg.det(linear) < 0:
         raise SceneError(
             "found a camera matrix that mirrors, shears or stretches, expected rotation, translation and uniform "
@@ -516,8 +517,8 @@ def _camera(scene: ScScene) -> Camera:
     eye = -linear @ scene.world_to_eye[:3, 3]
     return Camera(
         eye=eye,
-        look_at=eye - linear[:, 2] / math.sqrt(square),
-        up=linear[:, 1] / math.sqrt(square),
+        look_at=eye - linear[:, 2] / scale,
+        up=np.asarray(linear[:, 1] / scale, dtype=np.float64),
         fov_deg=scene.fov_deg,
         width=scene.width,
         height=scene.height,
@@ -580,16 +581,9 @@ def load_scene(path: str | Path | Iterable[str | Path], *, facet_error: float = 
         first = found[0]
         name = f"{material(first).name}" + ("" if first.group < 0 else f", group {first.group}")
         if isinstance(first, ScSphere):
-            vertices, faces, normals, distance = sphere_mesh(first.center, first.radius, facet_error)
             surfaces.append(
-                Surface.from_mesh(
-                    f"{name}, sphere {key[2]}",
-                    material(first),
-                    vertices,
-                    faces,
-                    vertex_normals=normals,
-                    sphere=Sphere(first.center, first.radius),
-                    facet_error=distance,
+                sphere_surface(
+                    f"{name}, sphere {key[2]}", material(first), first.center, first.radius, facet_error=facet_error
                 )
             )
         else:
@@ -605,4 +599,17 @@ def load_scene(path: str | Path | Iterable[str | Path], *, facet_error: float = 
         camera=_camera(source),
         background=source.background,
         path=source.paths[-1],
+        notes=_notes(source, facet_error),
     )
+
+
+def _notes(source: ScScene, facet_error: float) -> tuple[str, ...]:
+    """What :func:`load_scene` left out or changed."""
+    notes = []
+    if any(isinstance(primitive, ScSphere) for primitive in source.primitives):
+        notes.append(f"spheres are facets that lie within {facet_error:g} of their radius")
+    if source.lights:
+        notes.append("point lights fall with the square of the distance, which those of raycast do not")
+    if source.ambient.any():
+        notes.append("the ambient radiance was left out: radiosity computes what it stands for")
+    return tuple(notes)
