@@ -180,6 +180,9 @@ def _shadow(objects, piece, px, py, pz, a, b, normal, square, ra, rb, tolerance,
         return False  # not met, met in a corner, or lying in the plane: edge on, it hides nothing
     # Clip the cut to the light triangle: alpha > 0, beta > 0, 0 < alpha + beta < 1.
     lower, upper = 0.0, 1.0
+    # An end clipped by alpha = 0 or beta = 0 is an end of the light, s = 1 or 0, to the last digit;
+    # one that was not clipped keeps its digits: the neighbour's shadow begins there.
+    s0 = s1 = -1.0
     for side in range(4):
         if side == 0:
             f0, f1 = a0, a1
@@ -192,21 +195,19 @@ def _shadow(objects, piece, px, py, pz, a, b, normal, square, ra, rb, tolerance,
             f1 = (1.0 - a1 - b1) * max(ra, rb) - tolerance
         if f0 < 0.0 and f1 < 0.0:
             return False
-        if f0 < 0.0:
-            lower = max(lower, f0 / (f0 - f1))
-        elif f1 < 0.0:
-            upper = min(upper, f0 / (f0 - f1))
+        end = 1.0 - side if side < 2 else -1.0
+        if f0 < 0.0 and f0 / (f0 - f1) > lower:
+            lower, s0 = f0 / (f0 - f1), end
+        elif f1 < 0.0 and f0 / (f0 - f1) < upper:
+            upper, s1 = f0 / (f0 - f1), end
     if not lower < upper:
         return False
-    # An end that was not clipped keeps its digits: the neighbour's shadow begins there.
-    fa, fb, la, lb = a0, b0, a1, b1
-    if lower > 0.0:
-        fa, fb = a0 + lower * (a1 - a0), b0 + lower * (b1 - b0)
-    if upper < 1.0:
-        la, lb = a0 + upper * (a1 - a0), b0 + upper * (b1 - b0)
-    if not (fa + fb > 0.0 and la + lb > 0.0):
-        return False
-    s0, s1 = min(max(fb / (fa + fb), 0.0), 1.0), min(max(lb / (la + lb), 0.0), 1.0)
+    if s0 < 0.0:
+        fa, fb = (a0, b0) if lower == 0.0 else (a0 + lower * (a1 - a0), b0 + lower * (b1 - b0))
+        s0 = min(max(fb / (fa + fb), 0.0), 1.0)
+    if s1 < 0.0:
+        fa, fb = (a1, b1) if upper == 1.0 else (a0 + upper * (a1 - a0), b0 + upper * (b1 - b0))
+        s1 = min(max(fb / (fa + fb), 0.0), 1.0)
     interval[0], interval[1] = min(s0, s1), max(s0, s1)
     return True
 
