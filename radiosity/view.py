@@ -205,21 +205,21 @@ def render_preview(
 ) -> NDArray[np.uint8]:
     """The solution seen through a camera, by default that of :func:`solution_camera`.
 
-    Three bands are shown as red, green and blue; any other number as the sum over the bands with
-    a colour bar.
+    Three bands are shown as red, green and blue; any other number as the sum over the bands, with
+    a colour bar added at the right.
 
     Parameters
     ----------
     solution : Solution
     width, height : int, optional
-        Size of the picture; by default the camera's, at most :data:`PREVIEW_SIDE` a side. [pixels]
+        Size without the bar; by default the camera's, at most :data:`PREVIEW_SIDE` a side. [pixels]
     camera : Camera, optional
     samples : int
         Rays a pixel along each side.
 
     Returns
     -------
-    (height, width, 3) uint8
+    (height, width or more, 3) uint8
         sRGB, the top row first.
     """
     mesh = solution.mesh
@@ -228,8 +228,7 @@ def render_preview(
         scale = min(1.0, PREVIEW_SIDE / max(camera.width, camera.height))
         width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     colour = mesh.emission.shape[1] == 3
-    bar = 0 if colour else min(130, width // 3)
-    camera = replace(camera, width=width - bar, height=height)
+    camera = replace(camera, width=width, height=height)
     caster = _Caster(mesh, np.asarray(camera.eye, dtype=np.float64))
     triangle, weights = caster.cast(_directions(camera, samples))
     hit = triangle >= 0
@@ -243,7 +242,7 @@ def render_preview(
     luminance = seen[hit] @ _LUMINANCE if colour else seen[hit, 0]
     white = _white_level(luminance, emits)
     if not colour:
-        return _with_colour_bar(seen[:, 0], hit, white, mesh.emission.shape[1], camera, samples, bar)
+        return _with_colour_bar(seen[:, 0], hit, white, mesh.emission.shape[1], camera, samples)
     linear = np.minimum(seen / white, 1.0)
     background = np.asarray(solution.scene.background)
     if background.any():
@@ -266,7 +265,6 @@ def _with_colour_bar(
     bands: int,
     camera: Camera,
     samples: int,
-    bar: int,
 ) -> NDArray[np.uint8]:
     """One number a sample as colours, with the scale at the right."""
     from matplotlib import colormaps
@@ -280,6 +278,7 @@ def _with_colour_bar(
     colours[~hit] = 0.45  # grey: no colour of the scale
     picture = np.rint(_average(colours, camera, samples) * 255).astype(np.uint8)
     dpi = 100
+    bar = 130  # pixels: room for the scale, its numbers and the label
     figure = Figure(figsize=(bar / dpi, camera.height / dpi), dpi=dpi, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     label = "radiosity [W/m$^2$]" if bands == 1 else f"radiosity, sum of {bands} bands [W/m$^2$]"

@@ -99,7 +99,7 @@ def test_other_numbers_of_bands_get_a_colour_bar(bands):
     room = box("room", [0, 0, 0], [1, 1, 1], inward=True, material=material("grey", bands=bands))
     case = solved(room, camera=replace(camera([0.5, 0.5, 0.5], [1, 0.8, 0.6]), width=400, height=300))
     picture = view.render_preview(case)
-    assert picture.shape == (300, 400, 3)
+    assert picture.shape == (300, 400 + 130, 3)
     assert (picture[:, -130:] == 255).all(axis=2).mean() > 0.5  # white paper round the bar
     assert (picture[:, -130:].max(axis=2) < 60).any()  # black letters on it
 
