@@ -278,3 +278,8 @@ def test_choices_that_do_not_exist(tmp_path):
         RayCaster(scene, accelerator="octree")
     with pytest.raises(OptionError, match="workers: found 0"):
         RayCaster(scene, workers=0)
+    tiny = scene_of(tmp_path, f"world trans 1e12 0 0 {SQUARE}")
+    RayCaster(tiny)
+    for accelerator in ("voxels", "embree"):
+        with pytest.raises(OptionError, match="found a scene 1 in size at coordinates up to 1e"):
+            RayCaster(tiny, accelerator=accelerator)

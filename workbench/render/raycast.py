@@ -131,6 +131,27 @@ class _Embree:
         return Hits(t, primitive), Counters(rays=len(t), rays_hit=int((primitive >= 0).sum()))
 
 
+def _check_extent(scene: ScScene, accelerator: str) -> None:
+    """Refuse scenes whose extent is lost in the rounding of their coordinates: grids and Embree need one."""
+    if not scene.primitives:
+        return
+    bounds = np.asarray(
+        [
+            (p.center - p.radius, p.center + p.radius)
+            if isinstance(p, ScSphere)
+            else (p.vertices.min(axis=0), p.vertices.max(axis=0))
+            for p in scene.primitives
+        ]
+    )
+    extent = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
+    largest = float(np.abs(bounds).max())
+    if not extent > max(1e-30, 1e-9 * largest):
+        raise OptionError(
+            f"accelerator: found a scene {extent:.3g} in size at coordinates up to {largest:.3g}, expected a larger "
+            f"share of them for {accelerator!r}; use 'groups'"
+        )
+
+
 def _polygon_geometry(scene: ScScene) -> tuple[Geometry, IntArray]:
     """The polygons of a scene as flat geometry, and the primitive index of each."""
     polygons = np.asarray([i for i, p in enumerate(scene.primitives) if isinstance(p, ScPolygon)], dtype=np.int64)
@@ -170,7 +191,8 @@ class RayCaster:
     Raises
     ------
     OptionError
-        If a choice does not exist, or a side or ``workers`` is less than 1.
+        If a choice does not exist, a side or ``workers`` is less than 1, or the scene is so small for
+        its coordinates that voxels and Embree cannot resolve it.
     """
 
     def __init__(
@@ -190,6 +212,8 @@ class RayCaster:
         self.scene = scene
         self._groups = GroupVolumes(scene, volumes)
         self._accelerator: GroupVolumes | _Voxels | _Embree = self._groups
+        if accelerator != "groups":
+            _check_extent(scene, accelerator)
         if accelerator == "voxels":
             self._accelerator = _Voxels(scene, self.workers)
         elif accelerator == "embree":

@@ -83,6 +83,9 @@ def main(
 
     Several files are read in order into one scene, so a camera can stand in a file of its own:
     "raycast min.cam.sc min.nocam.sc" draws what "raycast min.sc" draws.
+
+    The language of .sc files is a reconstruction, not that of the course of 1996, whose documentation is
+    lost; the module workbench.scene.sc describes it.
     """
     from workbench.errors import InputError
     from workbench.record import RunRecord
