@@ -411,8 +411,13 @@ class VoxelGrid:
         high = boxes[:, 1].max(axis=0) if len(boxes) else np.full(3, 0.5)
         box = None
         if bounds is not None:
-            box = np.asarray(bounds, dtype=np.float64)
-            if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+            box = np.asarray(bounds)
+            if (
+                box.dtype.kind not in "iuf"
+                or box.shape != (2, 3)
+                or not np.isfinite(box).all()
+                or not (box[0] < box[1]).all()
+            ):
                 raise InputError(f"bounds: found {bounds!r}, expected a lower and an upper corner")
         size = high - low if box is None else box[1] - box[0]
         # A flat scene still needs voxels with a volume.
@@ -421,8 +426,11 @@ class VoxelGrid:
             edge = (size.prod() / (_CELLS_PER_OBJECT * max(len(boxes), 1))) ** (1.0 / 3.0)
             counts = np.clip(np.rint(size / edge), 1, _MAX_RESOLUTION)
         else:
-            counts = np.broadcast_to(np.asarray(resolution), (3,))
-            if not np.issubdtype(counts.dtype, np.integer) or (counts < 1).any() or counts.prod() > _MAX_CELLS:
+            counts = np.asarray(resolution)
+            if counts.shape == ():
+                counts = np.full(3, counts)
+            whole = counts.shape == (3,) and np.issubdtype(counts.dtype, np.integer)
+            if not whole or (counts < 1).any() or counts.prod() > _MAX_CELLS:
                 raise InputError(
                     f"resolution: found {resolution!r}, expected 1 or more along each axis, at most 2^24 voxels in all"
                 )
@@ -437,7 +445,7 @@ class VoxelGrid:
                 f"with {margin.max():.3g} to spare"
             )
         else:
-            low, high = box
+            low, high = box.astype(np.float64)
         cell = (high - low) / counts
         cursor = np.zeros(int(counts.prod()), dtype=np.int64)
         empty = np.empty(0, dtype=np.int64)
