@@ -336,12 +336,12 @@ def _check_on_light(lights: FloatArray, samples: FloatArray) -> None:
 class _Run:
     """The checked arguments that every loop shares, and the ids and threads it runs on."""
 
-    def __init__(self, grid, points, lights, skip_polygons, ids, workers, margin):
+    def __init__(self, grid, points, lights, skip_polygons, ids, workers):
         self.grid, self.points, self.lights = grid, points, lights
         self.skip = as_skip_polygons(skip_polygons, len(points))
         if ids is not None and (workers != 1 or len(ids.mailbox) != grid.object_count):
             raise InputError("ids: found more than one worker or another grid's ids, expected one worker, this grid")
-        self.ids, self.workers, self.margin = ids, workers, margin
+        self.ids, self.workers = ids, workers
         grid.check_origins(points)
         self.transparent = bool(grid.objects.clear.any())
         self.bands = grid.bands if self.transparent else 1
@@ -440,7 +440,7 @@ def light_occlusion(
         _check_on_light(lights, targets)
         if not (targets != place[:, None]).any(axis=2).all():
             raise InputError("samples: a sample lies on its point; move the point off the light")
-    run = _Run(grid, place, lights, skip_polygons, ids, workers, margin)
+    run = _Run(grid, place, lights, skip_polygons, ids, workers)
     if count_any_hit and run.transparent:
         raise InputError("count_any_hit: found transparent surfaces, expected opaque ones: no ray stops at its first")
     rays = targets.shape[1]
@@ -507,7 +507,7 @@ def adaptive_linear_occlusion(
     share = np.arange(2**most + 1)[:, None] / 2**most
     if (place[:, None] == lights[:, :1] + share * (lights[:, 1:] - lights[:, :1])).all(axis=2).any():
         raise InputError("points: a point lies on a sample of the light; move it off the light")
-    run = _Run(grid, place, lights, skip_polygons, ids, workers, margin)
+    run = _Run(grid, place, lights, skip_polygons, ids, workers)
     occlusion = np.empty((len(place), run.bands))
     shots = np.empty(len(place), dtype=np.int64)
     counters = run(
