@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 import signal
 import sys
 import time
@@ -169,7 +170,8 @@ def solve(
     names = ["solution.vtp", "solution.npz", "record.json"] + ([] if no_preview else ["preview.png"])
     click.echo(_summary(solution, [directory / name for name in names]), err=json_path == "-")
     if solution.stopped == "interrupted":
-        _complain(f"stopped by Ctrl-C; go on with: radiosity solve {scene} -o {directory} --resume")
+        again = shlex.join(["radiosity", "solve", scene, "-o", str(directory), "--resume"])
+        _complain(f"stopped by Ctrl-C; go on with: {again}")
         raise SystemExit(INTERRUPTED)
 
 

@@ -238,7 +238,7 @@ def render_preview(
     seen = np.zeros((len(triangle), corners.shape[1]))
     for i in range(3):
         seen[hit] += weights[hit, i, None] * corners[caster.corner[triangle[hit], i]]
-    emits = mesh.emission.any(axis=1)[caster.element[triangle[hit]]]
+    emits = np.asarray(mesh.emission.any(axis=1))[caster.element[triangle[hit]]]
     luminance = seen[hit] @ _LUMINANCE if colour else seen[hit, 0]
     white = _white_level(luminance, emits)
     if not colour:
