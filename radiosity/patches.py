@@ -258,8 +258,11 @@ def _polygon_count(rings: list[FloatArray], edge: float, split: int) -> int:
     return max(1, math.ceil(covered * nu * nv))
 
 
-def forecast_elements(scene: Scene, edge: float, split: int = 2) -> int:
-    """About how many elements :func:`build_mesh` makes for a largest edge, without making them."""
+def forecast_elements(scene: Scene, edge: float, split: int = 2, *, facets: bool = True) -> int:
+    """About how many elements :func:`build_mesh` makes for a largest edge, without making them.
+
+    With ``facets`` off, triangles of a mesh that are small enough as they are do not count.
+    """
     total = 0
     for surface in scene.surfaces:
         sides = 2 if surface.material.two_sided else 1
@@ -269,23 +272,27 @@ def forecast_elements(scene: Scene, edge: float, split: int = 2) -> int:
             longest = np.linalg.norm(np.roll(tri, -1, axis=1) - tri, axis=2).max(axis=1)
             n = np.maximum(1, np.ceil(longest / edge - 1e-9))
             n = np.where(n > 1, split * np.ceil(n / split), 1)
-            total += sides * int((n * n).sum())
+            total += sides * int((n * n)[facets | (n > 1)].sum())
         else:
             total += sides * sum(_polygon_count(rings, edge, split) for rings in surface.faces())
     return total
 
 
 def _edge_for(scene: Scene, geometry: Geometry, elements: int, split: int) -> float:
-    """Largest edge that gives about the asked number of elements, by bisection."""
+    """Largest edge that gives about the asked number of elements, by bisection.
+
+    Facets of a tessellated surface that need no division are not counted: a finely tessellated
+    object leaves the walls round it their share.
+    """
     high = 2.0 * geometry.size
-    if forecast_elements(scene, high, split) >= elements:
+    if forecast_elements(scene, high, split, facets=False) >= elements:
         return math.inf
     low = math.sqrt(float(geometry.polygon_area.sum()) / (4.0 * elements))
-    while forecast_elements(scene, low, split) < elements:
+    while forecast_elements(scene, low, split, facets=False) < elements and low > 1e-6 * geometry.size:
         low *= 0.5
     for _ in range(40):
         middle = math.sqrt(low * high)
-        if forecast_elements(scene, middle, split) > elements:
+        if forecast_elements(scene, middle, split, facets=False) > elements:
             low = middle
         else:
             high = middle
@@ -319,7 +326,8 @@ def build_mesh(
     scene, geometry : Scene, Geometry
         A scene and its flattened form.
     elements : int, optional
-        About how many elements to make; never fewer than one a polygon (and side).
+        About how many elements to make, facets of a tessellated surface that need no division
+        not counted; never fewer than one a polygon (and side).
     max_edge : float, optional
         Longest element edge instead. [scene lengths]  Neither: one element a polygon.
     split : int

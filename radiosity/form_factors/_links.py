@@ -29,6 +29,8 @@ SAMPLES = 16
 """Samples that stand for a cluster of facets from afar."""
 MAX_SENDER_PIECES = 4
 """Convex pieces above which a patch is treated as a cluster."""
+CLUSTER_FAR = 2.0
+"""Distance, in extents of a cluster, beyond which its samples stand for it."""
 MAX_CANDIDATES = 192
 """Longest candidate list handed down to a group; beyond it each point asks the tree itself."""
 
@@ -216,7 +218,7 @@ def workspace(max_corners: int) -> Workspace:
 
 
 @njit(nogil=True, cache=True)
-def _open_share(x, y, z, nx, ny, nz, corners, s0, s1, normals, s, slack):
+def open_share(x, y, z, nx, ny, nz, corners, s0, s1, normals, s, slack):
     """Lambert's formula for one sender piece; 0 from behind or in its plane."""
     mx, my, mz = normals[s, 0], normals[s, 1], normals[s, 2]
     height = mx * (x - corners[s0, 0]) + my * (y - corners[s0, 1]) + mz * (z - corners[s0, 2])
@@ -255,7 +257,7 @@ def _point_share(x, y, z, nx, ny, nz, own, geo, mesh, patch, found, count, limit
     other = mesh.patch_polygon[patch]
     for s in range(mesh.patch_sender[patch], mesh.patch_sender[patch + 1]):
         s0, s1 = mesh.sender_start[s], mesh.sender_start[s + 1]
-        share = _open_share(x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, mesh.sender_normal, s, geo.slack)
+        share = open_share(x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, mesh.sender_normal, s, geo.slack)
         if share <= 0.0:
             continue
         tally[_CLOSED] += 1
@@ -465,7 +467,7 @@ def _clear_rule(
                     x, y, z = points[i, 0], points[i, 1], points[i, 2]
                     for s in range(t0, t1):
                         total += points[i, 3] * max(
-                            _open_share(
+                            open_share(
                                 x, y, z, nx, ny, nz, sender_corners, sender_start[s], sender_start[s + 1],
                                 sender_normal, s, slack,
                             ),
@@ -475,7 +477,7 @@ def _clear_rule(
 
 
 @njit(nogil=True, cache=True)
-def _extent(bounds, patch):
+def patch_extent(bounds, patch):
     """Longest side of a patch's box."""
     longest = 0.0
     for axis in range(3):
@@ -501,6 +503,39 @@ def _sampled_share(centroids, normals, element, samples, sample_normals, patch, 
             backing -= d * sample_normals[patch, k, axis]
         if facing > 0.0 and backing > 0.0:
             total += facing * backing * part / (square * (math.pi * square + part))
+    return total
+
+
+@njit(nogil=True, cache=True)
+def _reverse_integral(
+    corners, starts, p0, p1, normals, element, sender_corners, sender_start, sender_normal, t0, t1, samples,
+    sample_normals, patch, patch_area, far, slack,
+):  # fmt: skip
+    """Integral of the form factor over a large element, as seen from a cluster's points.
+
+    From each sample of a far cluster, from each facet's centre of a near one, Lambert's formula over
+    the element; reciprocity makes the sum the exchange area.
+    """
+    total = 0.0
+    count = samples.shape[1] if far else t1 - t0
+    for k in range(count):
+        x = y = z = 0.0
+        if far:
+            part = patch_area / count
+            x, y, z = samples[patch, k, 0], samples[patch, k, 1], samples[patch, k, 2]
+            nx, ny, nz = sample_normals[patch, k, 0], sample_normals[patch, k, 1], sample_normals[patch, k, 2]
+        else:
+            s0, s1 = sender_start[t0 + k], sender_start[t0 + k + 1]
+            for i in range(s0, s1):
+                x += sender_corners[i, 0] / (s1 - s0)
+                y += sender_corners[i, 1] / (s1 - s0)
+                z += sender_corners[i, 2] / (s1 - s0)
+            nx, ny, nz = sender_normal[t0 + k, 0], sender_normal[t0 + k, 1], sender_normal[t0 + k, 2]
+            vx, vy, vz = newell_normal(sender_corners, s0, s1)
+            part = math.sqrt(vx * vx + vy * vy + vz * vz)
+        for piece in range(p0, p1):
+            a, b = starts[piece], starts[piece + 1]
+            total += part * max(open_share(x, y, z, nx, ny, nz, corners, a, b, normals, element, slack), 0.0)
     return total
 
 
@@ -556,18 +591,29 @@ def _clear_factor(element, patch, gap, cluster, geo, mesh, error, floor, closed_
 
     Far pairs: the element's 2 x 2 rule, whose error falls with the fourth power of size over
     distance; nearer: 4 x 4; near and touching pairs (all, with ``closed_forms``): the closed form.
-    A cluster of many facets is a set of samples from afar, the sum over its facets from nearby.
+    A cluster of many facets is a set of samples from afar, the sum over its facets from nearby; an
+    element too large for that is integrated the other way round, from the cluster's points.
     """
     area, size = mesh.area[element], mesh.size[element]
     reach = (0.05 / error) ** 0.25 * size
     value = doubt = 0.0
     tally[_CLOSED] += 1
     closed = not cluster and (closed_forms or gap < 0.5 * reach)
-    if cluster and gap > 2.0 * _extent(mesh.patch_bounds, patch):
-        share = _sampled_share(
+    extent = patch_extent(mesh.patch_bounds, patch) if cluster else 0.0
+    far = cluster and gap > CLUSTER_FAR * extent
+    if cluster and size > 0.5 * gap and size > 0.5 * extent:
+        value = _reverse_integral(
+            mesh.corners, mesh.piece_start, mesh.element_piece[element], mesh.element_piece[element + 1], mesh.normal,
+            element, mesh.sender_corners, mesh.sender_start, mesh.sender_normal, mesh.patch_sender[patch],
+            mesh.patch_sender[patch + 1], mesh.samples, mesh.sample_normals, patch, mesh.patch_area[patch], far,
+            geo.slack,
+        )  # fmt: skip
+        doubt = 0.05 * value
+    elif far:
+        value = area * _sampled_share(
             mesh.centroid, mesh.normal, element, mesh.samples, mesh.sample_normals, patch, mesh.patch_area[patch]
         )
-        value, doubt = share * area, 0.05 * share * area
+        doubt = 0.05 * value
     elif not (closed and closed_forms):
         levels = 0 if closed or cluster or gap >= reach else 1
         value = _clear_rule(
@@ -591,7 +637,7 @@ def _clear_factor(element, patch, gap, cluster, geo, mesh, error, floor, closed_
 
 
 @njit(nogil=True, cache=True)
-def _box_distance(centroid, element, bounds, patch):
+def box_distance(centroid, element, bounds, patch):
     """Distance from an element's centroid to the box round a patch."""
     square = 0.0
     for axis in range(3):
@@ -718,7 +764,7 @@ def shoot(
                 tally[_DARK] += e1 - e0
                 continue
         for e in range(e0, e1):
-            gap = _box_distance(mesh.centroid, e, mesh.patch_bounds, patch)
+            gap = box_distance(mesh.centroid, e, mesh.patch_bounds, patch)
             area = mesh.area[e]
             open_factor, doubt = _clear_factor(
                 e, patch, gap, cluster, geo, mesh, error, floor, closed_forms, work, tally

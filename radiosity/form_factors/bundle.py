@@ -20,12 +20,18 @@ from numba import njit
 from numpy.typing import NDArray
 
 from radiosity.form_factors._links import (
+    CLUSTER_FAR,
+    MAX_SENDER_PIECES,
+    SAMPLES,
     TALLY,
     MeshArrays,
     Workspace,
+    box_distance,
     longest_ring,
     mesh_arrays,
     occluder_arrays,
+    open_share,
+    patch_extent,
     shoot,
     workspace,
 )
@@ -36,6 +42,7 @@ from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
 from workbench.counters import Counters
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
+from workbench.geometry.planes import newell_normal
 
 __all__ = ["Columns", "LinkSettings", "ReceiverBundles"]
 
@@ -104,15 +111,38 @@ _G4 = 1.1673039782614187
 
 
 @njit(nogil=True, cache=True)
-def _bundle_rays(
-    elements, counts, patch, patch_area, seed, mesh, offset, centre, scale, starts, origins, directions, weights
-):  # fmt: skip
-    """Rays from random points of elements to random points of a patch, in Embree's unit frame.
+def _piece_shares(mesh, element, first, last, slack, shares):
+    """Cumulated form factors from an element's centroid to each piece of a near cluster; their sum."""
+    total = 0.0
+    for s in range(first, last):
+        total += max(
+            open_share(
+                mesh.centroid[element, 0], mesh.centroid[element, 1], mesh.centroid[element, 2],
+                mesh.normal[element, 0], mesh.normal[element, 1], mesh.normal[element, 2],
+                mesh.sender_corners, mesh.sender_start[s], mesh.sender_start[s + 1], mesh.sender_normal, s, slack,
+            ),
+            0.0,
+        )  # fmt: skip
+        shares[s - first] = total
+    return total
 
-    Element ``i`` tries ``counts[i]`` pairs; those that face each other become rays
-    ``starts[i]:starts[i + 1]`` with the kernel cos cos / r^2 as weight.  Returns the number of rays.
+
+@njit(nogil=True, cache=True)
+def _bundle_rays(
+    elements, counts, patch, seed, mesh, slack, offset, centre, scale, starts, origins, directions, weights
+):  # fmt: skip
+    """Rays from random points of elements toward a patch, in Embree's unit frame.
+
+    Element ``i`` gets rays ``starts[i]:starts[i + 1]``, at most ``counts[i]``, each with the weight that
+    its visibility carries: the kernel cos cos / r^2 at a random point of a patch; the sample's share
+    of a far cluster; one of a near cluster, whose facets are drawn by their form factors.  Pairs that
+    do not face each other get no ray.  Returns the number of rays.
     """
     x, y = np.empty(3), np.empty(3)
+    first, last = mesh.patch_sender[patch], mesh.patch_sender[patch + 1]
+    cluster = last - first > MAX_SENDER_PIECES
+    shares = np.empty(last - first)
+    extent = patch_extent(mesh.patch_bounds, patch)
     g1, g2, g3, g4 = 1.0 / _G4, 1.0 / _G4**2, 1.0 / _G4**3, 1.0 / _G4**4
     row = 0
     for i in range(elements.shape[0]):
@@ -124,30 +154,54 @@ def _bundle_rays(
         s3 = np.float64((h >> np.uint64(32)) & np.uint64(0xFFFF)) / 65536.0
         s4 = np.float64((h >> np.uint64(48)) & np.uint64(0xFFFF)) / 65536.0
         n = mesh.normal[e]
+        far = cluster and box_distance(mesh.centroid, e, mesh.patch_bounds, patch) > CLUSTER_FAR * extent
+        total = 0.0
+        if cluster and not far:
+            total = _piece_shares(mesh, e, first, last, slack, shares)
         for k in range(counts[i]):
             t = k + 0.5
             place_on_pieces(
                 mesh.corners, mesh.piece_start, mesh.element_piece[e], mesh.element_piece[e + 1], mesh.area[e],
                 (s1 + g1 * t) % 1.0, (s2 + g2 * t) % 1.0, x,
             )  # fmt: skip
-            piece = place_on_pieces(
-                mesh.sender_corners, mesh.sender_start, mesh.patch_sender[patch], mesh.patch_sender[patch + 1],
-                patch_area, (s3 + g3 * t) % 1.0, (s4 + g4 * t) % 1.0, y,
-            )  # fmt: skip
-            m = mesh.sender_normal[piece]
-            cx = cy = square = 0.0
-            for axis in range(3):
-                d = y[axis] - x[axis]
-                cx += d * n[axis]
-                cy -= d * m[axis]
-                square += d * d
+            u, v = (s3 + g3 * t) % 1.0, (s4 + g4 * t) % 1.0
+            mx = my = mz = 0.0
+            if far:
+                j = (k * SAMPLES) // counts[i] if counts[i] < SAMPLES else k % SAMPLES
+                y[0], y[1], y[2] = mesh.samples[patch, j, 0], mesh.samples[patch, j, 1], mesh.samples[patch, j, 2]
+                m = mesh.sample_normals[patch, j]
+                mx, my, mz = m[0], m[1], m[2]
+            else:
+                low, high = first, last
+                area = mesh.patch_area[patch]
+                if cluster:
+                    if total <= 0.0:
+                        break
+                    low = first + np.searchsorted(shares, s3 * total / counts[i] + k * total / counts[i])
+                    low = min(low, last - 1)
+                    high = low + 1
+                    u = (s3 * 977.0 + g3 * t) % 1.0
+                    vx, vy, vz = newell_normal(mesh.sender_corners, mesh.sender_start[low], mesh.sender_start[high])
+                    area = math.sqrt(vx * vx + vy * vy + vz * vz)
+                piece = place_on_pieces(mesh.sender_corners, mesh.sender_start, low, high, area, u, v, y)
+                m = mesh.sender_normal[piece]
+                mx, my, mz = m[0], m[1], m[2]
+            dx, dy, dz = y[0] - x[0], y[1] - x[1], y[2] - x[2]
+            cx = dx * n[0] + dy * n[1] + dz * n[2]
+            cy = -(dx * mx + dy * my + dz * mz)
             if cx <= 0.0 or cy <= 0.0:
                 continue
-            weights[row] = cx * cy / (square * square)
-            for axis in range(3):
-                start = x[axis] + offset * n[axis]
-                origins[row, axis] = (start - centre[axis]) * scale
-                directions[row, axis] = (y[axis] + offset * m[axis] - start) * scale
+            square = dx * dx + dy * dy + dz * dz
+            weights[row] = 1.0 if cluster and not far else cx * cy / (square * square)
+            sx, sy, sz = x[0] + offset * n[0], x[1] + offset * n[1], x[2] + offset * n[2]
+            origins[row, 0], origins[row, 1], origins[row, 2] = (
+                (sx - centre[0]) * scale,
+                (sy - centre[1]) * scale,
+                (sz - centre[2]) * scale,
+            )
+            directions[row, 0] = (y[0] + offset * mx - sx) * scale
+            directions[row, 1] = (y[1] + offset * my - sy) * scale
+            directions[row, 2] = (y[2] + offset * mz - sz) * scale
             row += 1
     starts[elements.shape[0]] = row
     return row
@@ -166,7 +220,8 @@ def _apply_shares(elements, starts, weights, blocked, factor, spread):
             if not blocked[k]:
                 seen += w
         if total <= 0.0:
-            # No pair faced the other: what little is seen is in doubt as a whole.
+            # No pair faced the other: a grazing glance at most; half of it, in doubt as a whole.
+            factor[e] *= 0.5
             spread[e] = factor[e]
             continue
         share = seen / total
@@ -266,8 +321,7 @@ class ReceiverBundles:
             directions = np.empty_like(origins)
             weights = np.empty(most)
             used = _bundle_rays(
-                elements[block], counts[block], patch, float(self.mesh.patch_area[patch]), self.settings.seed,
-                self._mesh, self.accelerator.offset, centre, scale, starts, origins, directions, weights,
+                elements[block], counts[block], patch, self.settings.seed, self._mesh, self._geo.slack, self.accelerator.offset, centre, scale, starts, origins, directions, weights,
             )  # fmt: skip
             clock = time.perf_counter()
             blocked = self.accelerator.blocked_unit(origins[:used], directions[:used], np.ones(used, dtype=np.float32))
