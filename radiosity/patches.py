@@ -3,7 +3,8 @@
 *Elements* receive light and hold radiosity; *patches*, groups of neighbouring elements, shoot it
 (M. F. Cohen, D. P. Greenberg, D. S. Immel and P. J. Brock, "An efficient radiosity approach for
 realistic image synthesis", IEEE CG&A 1986).  Quads stay quads.  A patch of a flat surface is one
-polygon that its elements tile; a patch of a tessellated surface is a cluster of small facets.
+polygon that its elements tile; on a tessellated surface elements and patches are clusters of facets:
+a mesh finer than the answer needs costs no more elements.
 """
 
 from __future__ import annotations
@@ -19,7 +20,12 @@ from numpy.typing import NDArray
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
 from workbench.geometry.polygons import convex_pieces, plane_basis, vector_area
-from workbench.scene.model import Scene
+from workbench.scene.model import Scene, Surface
+
+TESSELLATED = 64
+"""Faces from which a surface counts as tessellated, so that its small facets are clustered."""
+COARSE_CLUSTERS = 48
+"""Least number of cubes over a tessellated surface, however coarse the mesh."""
 
 __all__ = ["PatchMesh", "build_mesh", "forecast_elements"]
 
@@ -39,14 +45,15 @@ class PatchMesh:
         Corners of the elements' convex pieces, counter-clockwise from the lit side.
     piece_start : (m + 1,) int
     piece_element : (m,) int
-        Owner of each piece, ascending; nearly every element is one piece.
+        Owner of each piece, ascending; nearly every flat element is one piece.
+    piece_normal : (m, 3) float
     element_area : (n,) float
         [scene lengths squared]
     element_normal, element_centroid : (n, 3) float
     element_size : (n,) float
         Largest distance of a corner from the centroid, doubled.
     element_polygon : (n,) int
-        Polygon of the :class:`Geometry`.
+        Polygon of the :class:`Geometry`, -1 for a cluster of facets.
     element_surface : (n,) int
     element_side : (n,) int
         1 for the front of its polygon, -1 for the back of a two-sided one.
@@ -66,6 +73,7 @@ class PatchMesh:
     corners: FloatArray
     piece_start: IntArray
     piece_element: IntArray
+    piece_normal: FloatArray
     element_area: FloatArray
     element_normal: FloatArray
     element_centroid: FloatArray
@@ -258,11 +266,8 @@ def _polygon_count(rings: list[FloatArray], edge: float, split: int) -> int:
     return max(1, math.ceil(covered * nu * nv))
 
 
-def forecast_elements(scene: Scene, edge: float, split: int = 2, *, facets: bool = True) -> int:
-    """About how many elements :func:`build_mesh` makes for a largest edge, without making them.
-
-    With ``facets`` off, triangles of a mesh that are small enough as they are do not count.
-    """
+def forecast_elements(scene: Scene, edge: float, split: int = 2) -> int:
+    """About how many elements :func:`build_mesh` makes for a largest edge, without making them."""
     total = 0
     for surface in scene.surfaces:
         sides = 2 if surface.material.two_sided else 1
@@ -271,28 +276,32 @@ def forecast_elements(scene: Scene, edge: float, split: int = 2, *, facets: bool
             tri = surface.vertices[surface.ring_vertices].reshape(-1, 3, 3)
             longest = np.linalg.norm(np.roll(tri, -1, axis=1) - tri, axis=2).max(axis=1)
             n = np.maximum(1, np.ceil(longest / edge - 1e-9))
-            n = np.where(n > 1, split * np.ceil(n / split), 1)
-            total += sides * int((n * n)[facets | (n > 1)].sum())
+            n = np.where(n > 1, split * np.ceil(n / split), 1) ** 2
+            small = _small_facets(surface, edge)
+            if len(small):
+                corner = tri[small]
+                area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+                n[small] = 0
+                # A curved surface crosses about twice as many cubes as its area asks for.
+                cubes = max(2.0 * float(area.sum()) / edge**2, COARSE_CLUSTERS)
+                total += sides * int(min(cubes, len(small)))
+            total += sides * int(n.sum())
         else:
             total += sides * sum(_polygon_count(rings, edge, split) for rings in surface.faces())
     return total
 
 
 def _edge_for(scene: Scene, geometry: Geometry, elements: int, split: int) -> float:
-    """Largest edge that gives about the asked number of elements, by bisection.
-
-    Facets of a tessellated surface that need no division are not counted: a finely tessellated
-    object leaves the walls round it their share.
-    """
+    """Largest edge that gives about the asked number of elements, by bisection."""
     high = 2.0 * geometry.size
-    if forecast_elements(scene, high, split, facets=False) >= elements:
+    if forecast_elements(scene, high, split) >= elements:
         return math.inf
     low = math.sqrt(float(geometry.polygon_area.sum()) / (4.0 * elements))
-    while forecast_elements(scene, low, split, facets=False) < elements and low > 1e-6 * geometry.size:
+    while forecast_elements(scene, low, split) < elements and low > 1e-6 * geometry.size:
         low *= 0.5
     for _ in range(40):
         middle = math.sqrt(low * high)
-        if forecast_elements(scene, middle, split, facets=False) > elements:
+        if forecast_elements(scene, middle, split) > elements:
             low = middle
         else:
             high = middle
@@ -301,13 +310,29 @@ def _edge_for(scene: Scene, geometry: Geometry, elements: int, split: int) -> fl
     return high
 
 
-def _clusters(centroid: FloatArray, normal: FloatArray, cell: float) -> IntArray:
-    """Cluster number of facets that share a cube of side ``cell`` and face about the same way."""
+def _small_facets(surface: Surface, edge: float) -> IntArray:
+    """Faces of a tessellated surface that are no larger than an element: those are clustered."""
+    sizes = np.diff(surface.ring_offsets)
+    if surface.face_count < TESSELLATED or len(sizes) != surface.face_count:
+        return np.empty(0, np.int64)
+    corner = surface.vertices[surface.ring_vertices]
+    starts = surface.ring_offsets[:-1]
+    extent = np.maximum.reduceat(corner, starts) - np.minimum.reduceat(corner, starts)
+    small = np.flatnonzero(extent.max(axis=1) <= edge)
+    return small if len(small) >= TESSELLATED else np.empty(0, np.int64)
+
+
+def _clusters(centroid: FloatArray, normal: FloatArray, cell: float) -> tuple[IntArray, IntArray]:
+    """Element of each facet, and patch of each element, by place and direction.
+
+    Facets of one element share a cube of side ``cell`` and face the same of four directions an axis;
+    patches join the elements of cubes twice as large and of one octant.
+    """
     place = np.floor((centroid - centroid.min(axis=0)) / cell).astype(np.int64)
-    # Three bins a component: facets of one cluster lie within about 45 degrees of each other.
-    facing = np.floor((normal + 1.0) * 1.4999).astype(np.int64)
+    facing = np.floor((normal + 1.0) * 1.9999).astype(np.int64)
     key = np.concatenate([place, facing], axis=1)
-    return np.unique(key, axis=0, return_inverse=True)[1].ravel()
+    distinct, element = np.unique(key, axis=0, return_inverse=True)
+    return element.ravel(), np.unique(distinct // 2, axis=0, return_inverse=True)[1].ravel()
 
 
 def build_mesh(
@@ -326,8 +351,8 @@ def build_mesh(
     scene, geometry : Scene, Geometry
         A scene and its flattened form.
     elements : int, optional
-        About how many elements to make, facets of a tessellated surface that need no division
-        not counted; never fewer than one a polygon (and side).
+        About how many elements to make; never fewer than one a polygon (and side), or than a
+        coarse set of clusters on a tessellated surface.
     max_edge : float, optional
         Longest element edge instead. [scene lengths]  Neither: one element a polygon.
     split : int
@@ -360,36 +385,38 @@ def build_mesh(
     senders: list[list[FloatArray]] = []
     patch_polygon: list[int] = []
     number = 0
-    for surface in scene.surfaces:
+    surface_of: list[int] = []
+    for surface_index, surface in enumerate(scene.surfaces):
         sides = (1, -1) if surface.material.two_sided else (1,)
         faces = range(surface.face_count)
         sizes = np.diff(surface.ring_offsets)
         fine: set[int] = set()
-        # Small facets of a tessellated surface shoot together, as clusters.
-        if cluster and surface.face_count >= 64 and len(sizes) == surface.face_count:
+        small = _small_facets(surface, edge) if cluster else np.empty(0, np.int64)
+        if len(small):
+            fine = set(small.tolist())
+            first = surface.ring_offsets[small]
             corner = surface.vertices[surface.ring_vertices]
-            starts = surface.ring_offsets[:-1]
-            extent = np.maximum.reduceat(corner, starts) - np.minimum.reduceat(corner, starts)
-            small = np.flatnonzero(extent.max(axis=1) <= edge)
-            if len(small) >= 64:
-                fine = set(small.tolist())
-                area = float(geometry.polygon_area[number + small].sum())
-                # Large enough that a cluster gathers a dozen facets, small against the surface.
-                cell = max(min(edge, math.sqrt(area / 24)), math.sqrt(12 * area / len(small)))
-                centroid = np.add.reduceat(corner, starts)[small] / sizes[small, None]
-                group_of = _clusters(centroid, geometry.polygon_normal[number + small], cell)
-                for sign in sides:
-                    base = len(senders)
-                    groups: list[list[FloatArray]] = [[] for _ in range(int(group_of.max()) + 1)]
-                    for face, group in zip(small.tolist(), group_of.tolist(), strict=True):
-                        ring = surface.face(face)[0][::sign]
-                        rings.append([ring])
-                        polygon.append(number + face)
-                        side.append(sign)
-                        patch.append(base + group)
-                        groups[group].append(ring)
-                    senders.extend(groups)
-                    patch_polygon.extend([-1] * len(groups))
+            centroid = np.add.reduceat(corner, surface.ring_offsets[:-1])[small] / sizes[small, None]
+            small_area = float(geometry.polygon_area[number + small].sum())
+            element_of, patch_of = _clusters(
+                centroid, geometry.polygon_normal[number + small], min(edge, math.sqrt(small_area / COARSE_CLUSTERS))
+            )
+            facets = [corner[start : start + size] for start, size in zip(first, sizes[small], strict=True)]
+            for sign in sides:
+                base = len(senders)
+                groups: list[list[FloatArray]] = [[] for _ in patch_of]
+                for facet, group in zip(facets, element_of.tolist(), strict=True):
+                    groups[group].append(facet[::sign])
+                rings.extend(groups)
+                polygon.extend([-1] * len(groups))
+                surface_of.extend([surface_index] * len(groups))
+                side.extend([sign] * len(groups))
+                patch.extend((base + patch_of).tolist())
+                merged: list[list[FloatArray]] = [[] for _ in range(int(patch_of.max()) + 1)]
+                for group, owner in zip(groups, patch_of.tolist(), strict=True):
+                    merged[owner].extend(group)
+                senders.extend(merged)
+                patch_polygon.extend([-1] * len(merged))
         for face in faces:
             if face in fine:
                 continue
@@ -406,6 +433,7 @@ def build_mesh(
                 base = len(senders)
                 rings.extend([loop[::sign] for loop in element] for element in part.elements)
                 polygon.extend([number + face] * len(part.elements))
+                surface_of.extend([surface_index] * len(part.elements))
                 side.extend([sign] * len(part.elements))
                 patch.extend(base + p for p in part.patch_of)
                 senders.extend([loop[::sign] for loop in sender] for sender in part.senders)
@@ -417,14 +445,15 @@ def build_mesh(
     element_patch = np.asarray(patch, dtype=np.int64)[order]
     element_polygon = np.asarray(polygon, dtype=np.int64)[order]
     element_side = np.asarray(side, dtype=np.int64)[order]
-    element_surface = geometry.polygon_surface[element_polygon]
+    element_surface = np.asarray(surface_of, dtype=np.int64)[order]
     flat = [loop for element in rings for loop in element]
     piece_start = np.concatenate([[0], np.cumsum([len(loop) for loop in flat])]).astype(np.int64)
     corners = np.ascontiguousarray(np.concatenate(flat))
     piece_element = np.repeat(np.arange(len(rings)), [len(element) for element in rings]).astype(np.int64)
-    area, centroid = _area_and_centroid(corners, piece_start, piece_element, len(rings))
+    element_area, centroid = _area_and_centroid(corners, piece_start, piece_element, len(rings))
     away = np.linalg.norm(corners - centroid[np.repeat(piece_element, np.diff(piece_start))], axis=1)
     first_corner = piece_start[np.searchsorted(piece_element, np.arange(len(rings)))]
+    piece_vector = _vector_areas(corners, piece_start)
     sender_flat = [loop for sender in senders for loop in sender]
     sender_start = np.concatenate([[0], np.cumsum([len(loop) for loop in sender_flat])]).astype(np.int64)
     sender_corners = np.ascontiguousarray(np.concatenate(sender_flat))
@@ -434,8 +463,9 @@ def build_mesh(
         corners=corners,
         piece_start=piece_start,
         piece_element=piece_element,
-        element_area=area,
-        element_normal=np.ascontiguousarray(geometry.polygon_normal[element_polygon] * element_side[:, None]),
+        element_area=element_area,
+        element_normal=_element_normals(geometry, element_polygon, element_side, piece_vector, piece_element),
+        piece_normal=np.ascontiguousarray(piece_vector / np.linalg.norm(piece_vector, axis=1)[:, None]),
         element_centroid=centroid,
         element_size=2.0 * np.maximum.reduceat(away, first_corner),
         element_polygon=element_polygon,
@@ -454,13 +484,24 @@ def build_mesh(
     )
 
 
+def _element_normals(
+    geometry: Geometry, polygon: IntArray, side: IntArray, piece_vector: FloatArray, piece_element: IntArray
+) -> FloatArray:
+    """Normals of the polygons, and of clusters the mean direction of their facets."""
+    total = np.stack([np.bincount(piece_element, piece_vector[:, k], len(polygon)) for k in range(3)], axis=1)
+    normal = total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
+    flat = polygon >= 0
+    normal[flat] = geometry.polygon_normal[polygon[flat]] * side[flat, None]
+    return np.ascontiguousarray(normal)
+
+
 def _fans(corners: FloatArray, starts: IntArray) -> tuple[FloatArray, IntArray]:
     """Fan triangles (t, 3, 3) of rings, and the ring (t,) of each."""
     counts = np.diff(starts) - 2
     ring = np.repeat(np.arange(len(counts)), counts)
     first = np.repeat(starts[:-1], counts)
     step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    return corners[np.stack([first, first + step + 1, first + step + 2], axis=1)], ring
+    return corners[np.stack([first, first + step + 1, first + step + 2], axis=1)], ring.astype(np.int64)
 
 
 def _vector_areas(corners: FloatArray, starts: IntArray) -> FloatArray:

@@ -27,8 +27,8 @@ from workbench.shadow.area import MAX_CORNERS, MAX_PIECES, visible_share
 
 SAMPLES = 16
 """Samples that stand for a cluster of facets from afar."""
-MAX_SENDER_PIECES = 4
-"""Convex pieces above which a patch is treated as a cluster."""
+POINTS = 4
+"""Points at which a cluster of facets receives."""
 CLUSTER_FAR = 2.0
 """Distance, in extents of a cluster, beyond which its samples stand for it."""
 MAX_CANDIDATES = 192
@@ -100,6 +100,7 @@ class MeshArrays(NamedTuple):
     corners: np.ndarray
     piece_start: np.ndarray
     element_piece: np.ndarray
+    piece_normal: np.ndarray
     normal: np.ndarray
     area: np.ndarray
     centroid: np.ndarray
@@ -117,6 +118,8 @@ class MeshArrays(NamedTuple):
     element_bounds: np.ndarray
     samples: np.ndarray
     sample_normals: np.ndarray
+    points: np.ndarray
+    point_normals: np.ndarray
 
 
 class Workspace(NamedTuple):
@@ -156,19 +159,27 @@ def occluder_arrays(geometry: Geometry, tree: BoxTree) -> OccluderArrays:
     )
 
 
-def _patch_samples(mesh: PatchMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals (q, SAMPLES, 3) that stand for equal parts of each cluster's area."""
-    points = np.zeros((mesh.patch_count, SAMPLES, 3))
-    normals = np.zeros_like(points)
-    for patch in np.flatnonzero(np.diff(mesh.patch_sender) > MAX_SENDER_PIECES).tolist():
-        first, last = mesh.patch_sender[patch], mesh.patch_sender[patch + 1]
-        for k in range(SAMPLES):
-            u, v = (k + 0.5) / SAMPLES, (k * 0.6180339887498949 + 0.5) % 1.0
-            piece = place_on_pieces(
-                mesh.sender_corners, mesh.sender_start, first, last, mesh.patch_area[patch], u, v, points[patch, k]
-            )
-            normals[patch, k] = mesh.sender_normal[piece]
-    return points, normals
+def _cluster_samples(
+    corners: np.ndarray,
+    starts: np.ndarray,
+    normals: np.ndarray,
+    owner: np.ndarray,
+    areas: np.ndarray,
+    polygon: np.ndarray,
+    count: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, count, 3) that stand for equal parts of each cluster's area.
+
+    ``owner`` (n + 1,) gives the pieces of each; flat ones (``polygon`` not -1) stay zero.
+    """
+    points = np.zeros((len(areas), count, 3))
+    directions = np.zeros_like(points)
+    for i in np.flatnonzero(polygon < 0).tolist():
+        for k in range(count):
+            u, v = (k + 0.5) / count, (k * 0.6180339887498949 + 0.5) % 1.0
+            piece = place_on_pieces(corners, starts, owner[i], owner[i + 1], areas[i], u, v, points[i, k])
+            directions[i, k] = normals[piece]
+    return points, directions
 
 
 def mesh_arrays(mesh: PatchMesh) -> MeshArrays:
@@ -177,6 +188,7 @@ def mesh_arrays(mesh: PatchMesh) -> MeshArrays:
         mesh.corners,
         mesh.piece_start,
         mesh.element_piece,
+        mesh.piece_normal,
         mesh.element_normal,
         mesh.element_area,
         mesh.element_centroid,
@@ -192,7 +204,24 @@ def mesh_arrays(mesh: PatchMesh) -> MeshArrays:
         mesh.patch_normal,
         mesh.patch_area,
         mesh.element_bounds,
-        *_patch_samples(mesh),
+        *_cluster_samples(
+            mesh.sender_corners,
+            mesh.sender_start,
+            mesh.sender_normal,
+            mesh.patch_sender,
+            mesh.patch_area,
+            mesh.patch_polygon,
+            SAMPLES,
+        ),
+        *_cluster_samples(
+            mesh.corners,
+            mesh.piece_start,
+            mesh.piece_normal,
+            mesh.element_piece,
+            mesh.element_area,
+            mesh.element_polygon,
+            POINTS,
+        ),
     )
 
 
@@ -262,9 +291,7 @@ def _point_share(x, y, z, nx, ny, nz, own, geo, mesh, patch, found, count, limit
             continue
         tally[_CLOSED] += 1
         normal = mesh.sender_normal[s]
-        used = light_pyramid(
-            x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, normal, 2.0 * geo.slack, work.planes
-        )
+        used = light_pyramid(x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, normal, 2.0 * geo.slack, work.planes)
         kept = _pick(
             found, count, own, other, geo.piece_polygon, geo.corners, geo.piece_start, work.planes, used,
             geo.slack, limit, work.picked, tally,
@@ -486,21 +513,21 @@ def patch_extent(bounds, patch):
 
 
 @njit(nogil=True, cache=True)
-def _sampled_share(centroids, normals, element, samples, sample_normals, patch, patch_area):
-    """Form factor from an element's centroid to a far cluster, by its samples.
+def _sampled_share(x, n, samples, sample_normals, patch_area):
+    """Form factor from a point to a far cluster, by its samples.
 
     Each stands for an equal part of the area, as a disk (Wallace, Elmquist and Haines 1989, eq. 7).
     """
-    count = samples.shape[1]
+    count = samples.shape[0]
     part = patch_area / count
     total = 0.0
     for k in range(count):
         square = facing = backing = 0.0
         for axis in range(3):
-            d = samples[patch, k, axis] - centroids[element, axis]
+            d = samples[k, axis] - x[axis]
             square += d * d
-            facing += d * normals[element, axis]
-            backing -= d * sample_normals[patch, k, axis]
+            facing += d * n[axis]
+            backing -= d * sample_normals[k, axis]
         if facing > 0.0 and backing > 0.0:
             total += facing * backing * part / (square * (math.pi * square + part))
     return total
@@ -508,8 +535,8 @@ def _sampled_share(centroids, normals, element, samples, sample_normals, patch, 
 
 @njit(nogil=True, cache=True)
 def _reverse_integral(
-    corners, starts, p0, p1, normals, element, sender_corners, sender_start, sender_normal, t0, t1, samples,
-    sample_normals, patch, patch_area, far, slack,
+    corners, starts, p0, p1, normals, sender_corners, sender_start, sender_normal, t0, t1, samples, sample_normals,
+    patch_area, far, slack,
 ):  # fmt: skip
     """Integral of the form factor over a large element, as seen from a cluster's points.
 
@@ -517,13 +544,13 @@ def _reverse_integral(
     the element; reciprocity makes the sum the exchange area.
     """
     total = 0.0
-    count = samples.shape[1] if far else t1 - t0
+    count = samples.shape[0] if far else t1 - t0
     for k in range(count):
         x = y = z = 0.0
         if far:
             part = patch_area / count
-            x, y, z = samples[patch, k, 0], samples[patch, k, 1], samples[patch, k, 2]
-            nx, ny, nz = sample_normals[patch, k, 0], sample_normals[patch, k, 1], sample_normals[patch, k, 2]
+            x, y, z = samples[k, 0], samples[k, 1], samples[k, 2]
+            nx, ny, nz = sample_normals[k, 0], sample_normals[k, 1], sample_normals[k, 2]
         else:
             s0, s1 = sender_start[t0 + k], sender_start[t0 + k + 1]
             for i in range(s0, s1):
@@ -535,7 +562,7 @@ def _reverse_integral(
             part = math.sqrt(vx * vx + vy * vy + vz * vz)
         for piece in range(p0, p1):
             a, b = starts[piece], starts[piece + 1]
-            total += part * max(open_share(x, y, z, nx, ny, nz, corners, a, b, normals, element, slack), 0.0)
+            total += part * max(open_share(x, y, z, nx, ny, nz, corners, a, b, normals, piece, slack), 0.0)
     return total
 
 
@@ -586,36 +613,54 @@ def _shaft_candidates(box, flat, normal, corner, own, patch, geo, mesh, found, w
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _clear_factor(element, patch, gap, cluster, geo, mesh, error, floor, closed_forms, work, tally):
+def _clear_factor(element, patch, gap, flat, flat_sender, geo, mesh, error, floor, closed_forms, work, tally):
     """Unoccluded form factor from an element to a patch, and the estimate of its error.
 
     Far pairs: the element's 2 x 2 rule, whose error falls with the fourth power of size over
     distance; nearer: 4 x 4; near and touching pairs (all, with ``closed_forms``): the closed form.
-    A cluster of many facets is a set of samples from afar, the sum over its facets from nearby; an
-    element too large for that is integrated the other way round, from the cluster's points.
+    A cluster of facets is a set of samples from afar, the sum over its facets from nearby; a flat
+    element too large for that is integrated the other way round, from the cluster's points.  A
+    cluster receives at its own samples.
     """
     area, size = mesh.area[element], mesh.size[element]
     reach = (0.05 / error) ** 0.25 * size
     value = doubt = 0.0
     tally[_CLOSED] += 1
-    closed = not cluster and (closed_forms or gap < 0.5 * reach)
-    extent = patch_extent(mesh.patch_bounds, patch) if cluster else 0.0
-    far = cluster and gap > CLUSTER_FAR * extent
-    if cluster and size > 0.5 * gap and size > 0.5 * extent:
+    closed = flat and flat_sender and (closed_forms or gap < 0.5 * reach)
+    extent = 0.0 if flat_sender else patch_extent(mesh.patch_bounds, patch)
+    far = not flat_sender and gap > CLUSTER_FAR * extent
+    if flat and not flat_sender and size > 0.5 * gap and size > 0.5 * extent:
         value = _reverse_integral(
-            mesh.corners, mesh.piece_start, mesh.element_piece[element], mesh.element_piece[element + 1], mesh.normal,
-            element, mesh.sender_corners, mesh.sender_start, mesh.sender_normal, mesh.patch_sender[patch],
-            mesh.patch_sender[patch + 1], mesh.samples, mesh.sample_normals, patch, mesh.patch_area[patch], far,
-            geo.slack,
+            mesh.corners, mesh.piece_start, mesh.element_piece[element], mesh.element_piece[element + 1],
+            mesh.piece_normal, mesh.sender_corners, mesh.sender_start, mesh.sender_normal, mesh.patch_sender[patch],
+            mesh.patch_sender[patch + 1], mesh.samples[patch], mesh.sample_normals[patch], mesh.patch_area[patch],
+            far, geo.slack,
         )  # fmt: skip
         doubt = 0.05 * value
-    elif far:
+    elif far and flat:
         value = area * _sampled_share(
-            mesh.centroid, mesh.normal, element, mesh.samples, mesh.sample_normals, patch, mesh.patch_area[patch]
-        )
+            mesh.centroid[element], mesh.normal[element], mesh.samples[patch], mesh.sample_normals[patch],
+            mesh.patch_area[patch],
+        )  # fmt: skip
         doubt = 0.05 * value
+    elif not flat:
+        for k in range(POINTS):
+            x, n = mesh.points[element, k], mesh.point_normals[element, k]
+            if far:
+                value += _sampled_share(x, n, mesh.samples[patch], mesh.sample_normals[patch], mesh.patch_area[patch])
+                continue
+            for s in range(mesh.patch_sender[patch], mesh.patch_sender[patch + 1]):
+                value += max(
+                    open_share(
+                        x[0], x[1], x[2], n[0], n[1], n[2], mesh.sender_corners, mesh.sender_start[s],
+                        mesh.sender_start[s + 1], mesh.sender_normal, s, geo.slack,
+                    ),
+                    0.0,
+                )  # fmt: skip
+        value *= area / POINTS
+        doubt = 0.1 * value
     elif not (closed and closed_forms):
-        levels = 0 if closed or cluster or gap >= reach else 1
+        levels = 0 if closed or not flat_sender or gap >= reach else 1
         value = _clear_rule(
             mesh.corners, mesh.piece_start, mesh.element_piece[element], mesh.element_piece[element + 1], mesh.normal,
             element, mesh.sender_corners, mesh.sender_start, mesh.sender_normal, mesh.patch_sender[patch],
@@ -728,9 +773,7 @@ def shoot(
     factor and ``rays[e]`` is set.  The wanted error of a form factor F is ``error * F + floor``;
     ``closed_forms`` asks for the closed form of every unoccluded pair, not only of near ones.
     """
-    own_low, own_high = mesh.patch_bounds[patch, 0], mesh.patch_bounds[patch, 1]
     flat_sender = mesh.patch_polygon[patch] >= 0
-    cluster = mesh.patch_sender[patch + 1] - mesh.patch_sender[patch] > MAX_SENDER_PIECES
     for q in range(first, last):
         e0, e1 = mesh.patch_start[q], mesh.patch_start[q + 1]
         flat = mesh.patch_polygon[q] >= 0
@@ -743,8 +786,8 @@ def shoot(
             continue
         # Shaft from the group to the patch; its candidates serve every element of the group.
         count = _shaft_candidates(
-            mesh.patch_bounds[q], flat, mesh.patch_normal[q], mesh.sender_corners[mesh.sender_start[mesh.patch_sender[q]]],
-            mesh.polygon[e0], patch, geo, mesh, work.found, work, tally,
+            mesh.patch_bounds[q], flat, mesh.patch_normal[q],
+            mesh.sender_corners[mesh.sender_start[mesh.patch_sender[q]]], mesh.polygon[e0], patch, geo, mesh, work.found, work, tally,
         )  # fmt: skip
         tally[_SHAFT] += 1
         if count == 0:
@@ -767,7 +810,7 @@ def shoot(
             gap = box_distance(mesh.centroid, e, mesh.patch_bounds, patch)
             area = mesh.area[e]
             open_factor, doubt = _clear_factor(
-                e, patch, gap, cluster, geo, mesh, error, floor, closed_forms, work, tally
+                e, patch, gap, flat, flat_sender, geo, mesh, error, floor, closed_forms, work, tally
             )
             if open_factor <= 0.0:
                 tally[_HORIZON] += 1
@@ -778,7 +821,8 @@ def shoot(
                 spread[e] = doubt
                 continue
             candidates, many = work.found, count
-            if cluster:
+            if not (flat and flat_sender):
+                # Facets of a cluster are candidates of its own shaft: rays see best which of them block.
                 factor[e] = open_factor
                 rays[e] = True
                 tally[_COMPLEX] += 1

@@ -13,13 +13,12 @@ from radiosity.form_factors._contour import contour_integral
 from workbench.arrays import as_points, as_unit_vectors
 from workbench.errors import InputError
 from workbench.geometry.lambert import lambert_piece
-from workbench.geometry.planes import clip_by_plane, newell_normal
+from workbench.geometry.planes import clip_by_plane
 from workbench.geometry.polygons import check_polygon, convex_pieces, vector_area
 
 __all__ = ["crossed_strings", "pair_exchange", "point_to_polygon", "polygon_to_polygon"]
 
 FloatArray = NDArray[np.float64]
-Rings = ArrayLike | Sequence[ArrayLike]
 
 ON_PLANE = 1e-13
 """A corner this close to a plane, as a share of the pair's size, counts as on it."""
@@ -27,7 +26,7 @@ ON_PLANE = 1e-13
 _MAX_CORNERS = 64
 
 
-def _as_pieces(polygon: Rings, holes: Sequence[ArrayLike], name: str) -> tuple[list[FloatArray], FloatArray, float]:
+def _as_pieces(polygon: ArrayLike, holes: Sequence[ArrayLike], name: str) -> tuple[list[FloatArray], FloatArray, float]:
     """Convex pieces, unit normal and area of a polygon with holes given by a caller."""
     outer = as_points(polygon, name)
     rings = [outer]

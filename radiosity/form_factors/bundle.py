@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from radiosity.form_factors._links import (
     CLUSTER_FAR,
-    MAX_SENDER_PIECES,
     SAMPLES,
     TALLY,
     MeshArrays,
@@ -134,13 +133,13 @@ def _bundle_rays(
     """Rays from random points of elements toward a patch, in Embree's unit frame.
 
     Element ``i`` gets rays ``starts[i]:starts[i + 1]``, at most ``counts[i]``, each with the weight that
-    its visibility carries: the kernel cos cos / r^2 at a random point of a patch; the sample's share
-    of a far cluster; one of a near cluster, whose facets are drawn by their form factors.  Pairs that
-    do not face each other get no ray.  Returns the number of rays.
+    its visibility carries: the kernel cos cos / r^2 over the density of its points, which are
+    uniform on a flat patch, the samples of a far cluster, and drawn by their facets' form factors on
+    a near one.  Pairs that do not face each other get no ray.  Returns the number of rays.
     """
     x, y = np.empty(3), np.empty(3)
     first, last = mesh.patch_sender[patch], mesh.patch_sender[patch + 1]
-    cluster = last - first > MAX_SENDER_PIECES
+    cluster = mesh.patch_polygon[patch] < 0
     shares = np.empty(last - first)
     extent = patch_extent(mesh.patch_bounds, patch)
     g1, g2, g3, g4 = 1.0 / _G4, 1.0 / _G4**2, 1.0 / _G4**3, 1.0 / _G4**4
@@ -153,19 +152,20 @@ def _bundle_rays(
         s2 = np.float64((h >> np.uint64(16)) & np.uint64(0xFFFF)) / 65536.0
         s3 = np.float64((h >> np.uint64(32)) & np.uint64(0xFFFF)) / 65536.0
         s4 = np.float64((h >> np.uint64(48)) & np.uint64(0xFFFF)) / 65536.0
-        n = mesh.normal[e]
         far = cluster and box_distance(mesh.centroid, e, mesh.patch_bounds, patch) > CLUSTER_FAR * extent
         total = 0.0
         if cluster and not far:
             total = _piece_shares(mesh, e, first, last, slack, shares)
         for k in range(counts[i]):
             t = k + 0.5
-            place_on_pieces(
+            own = place_on_pieces(
                 mesh.corners, mesh.piece_start, mesh.element_piece[e], mesh.element_piece[e + 1], mesh.area[e],
                 (s1 + g1 * t) % 1.0, (s2 + g2 * t) % 1.0, x,
             )  # fmt: skip
+            n = mesh.piece_normal[own]
             u, v = (s3 + g3 * t) % 1.0, (s4 + g4 * t) % 1.0
             mx = my = mz = 0.0
+            density = 1.0
             if far:
                 j = (k * SAMPLES) // counts[i] if counts[i] < SAMPLES else k % SAMPLES
                 y[0], y[1], y[2] = mesh.samples[patch, j, 0], mesh.samples[patch, j, 1], mesh.samples[patch, j, 2]
@@ -183,6 +183,8 @@ def _bundle_rays(
                     u = (s3 * 977.0 + g3 * t) % 1.0
                     vx, vy, vz = newell_normal(mesh.sender_corners, mesh.sender_start[low], mesh.sender_start[high])
                     area = math.sqrt(vx * vx + vy * vy + vz * vz)
+                    # Drawn with a density of its form factor over its area.
+                    density = (shares[low - first] - (shares[low - first - 1] if low > first else 0.0)) / area
                 piece = place_on_pieces(mesh.sender_corners, mesh.sender_start, low, high, area, u, v, y)
                 m = mesh.sender_normal[piece]
                 mx, my, mz = m[0], m[1], m[2]
@@ -192,7 +194,7 @@ def _bundle_rays(
             if cx <= 0.0 or cy <= 0.0:
                 continue
             square = dx * dx + dy * dy + dz * dz
-            weights[row] = 1.0 if cluster and not far else cx * cy / (square * square)
+            weights[row] = cx * cy / (square * square * density)
             sx, sy, sz = x[0] + offset * n[0], x[1] + offset * n[1], x[2] + offset * n[2]
             origins[row, 0], origins[row, 1], origins[row, 2] = (
                 (sx - centre[0]) * scale,
@@ -321,7 +323,8 @@ class ReceiverBundles:
             directions = np.empty_like(origins)
             weights = np.empty(most)
             used = _bundle_rays(
-                elements[block], counts[block], patch, self.settings.seed, self._mesh, self._geo.slack, self.accelerator.offset, centre, scale, starts, origins, directions, weights,
+                elements[block], counts[block], patch, self.settings.seed, self._mesh, self._geo.slack,
+                self.accelerator.offset, centre, scale, starts, origins, directions, weights,
             )  # fmt: skip
             clock = time.perf_counter()
             blocked = self.accelerator.blocked_unit(origins[:used], directions[:used], np.ones(used, dtype=np.float32))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radiosity.interpolation import corner_values
 from radiosity.patches import PatchMesh
 from workbench.counters import Counters
 from workbench.errors import InputError
@@ -76,6 +77,11 @@ class EnergyBook:
         return {f"{f.name}_W": getattr(self, f.name).tolist() for f in dataclasses.fields(self)}
 
 
+def _column(values: NDArray) -> NDArray:
+    """Values as VTK takes them: one band as a plain array."""
+    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+
+
 @dataclass
 class Solution:
     """Radiosity, irradiance and unshot radiosity on the elements of a mesh.
@@ -114,24 +120,8 @@ class Solution:
         return self.mesh.element_area @ self.unshot
 
     def vertex_radiosity(self) -> FloatArray:
-        """Radiosity at the corners of the elements' pieces (k, bands), averaged within a surface.
-
-        Corners that coincide and belong to the same side of the same surface (or, on flat
-        surfaces, the same polygon) share the area-weighted mean of their elements.
-        """
-        mesh = self.mesh
-        size = float(np.ptp(mesh.corners, axis=0).max()) or 1.0
-        place = np.round((mesh.corners - mesh.corners.min(axis=0)) * (1e7 / size)).astype(np.int64)
-        owner = np.repeat(mesh.piece_element, np.diff(mesh.piece_start))
-        # Shading is smooth across facets that turn by less than about 30 degrees, sharp across more.
-        facing = np.round(mesh.element_normal[owner] * 2.0).astype(np.int64)
-        key = np.column_stack([place, facing, mesh.element_surface[owner]])
-        _, group = np.unique(key, axis=0, return_inverse=True)
-        group = group.ravel()
-        weight = mesh.element_area[owner]
-        total = np.bincount(group, weight)
-        bands = [np.bincount(group, weight * self.radiosity[owner, b]) / total for b in range(self.radiosity.shape[1])]
-        return np.stack(bands, axis=1)[group]
+        """Radiosity interpolated to the corners of the mesh's pieces, (k, bands). [W m-2]"""
+        return corner_values(self.mesh, self.radiosity)
 
     def to_pyvista(self) -> pyvista.PolyData:
         """The mesh with its arrays, for pyvista.
@@ -158,8 +148,8 @@ class Solution:
             ("patch_id", mesh.element_patch),
             ("element_id", np.arange(mesh.element_count)),
         ):
-            poly.cell_data[name] = np.squeeze(values[owner])
-        poly.point_data["radiosity_W_m2"] = np.squeeze(self.vertex_radiosity())
+            poly.cell_data[name] = _column(values[owner])
+        poly.point_data["radiosity_W_m2"] = _column(self.vertex_radiosity())
         poly.field_data["surface_names"] = np.asarray([s.name for s in self.scene.surfaces])
         return poly
 

@@ -26,7 +26,9 @@ METHODS = ("auto", "progressive", "direct")
 
 DEFAULT_ELEMENTS = 2000
 DIRECT_ELEMENTS = 64
-"""Scenes of at most this many elements are solved directly, with form factors good to 1e-8."""
+"""Scenes of at most this many elements are solved directly."""
+EXACT_ELEMENTS = 12
+"""Up to this many elements form factors are found to 1e-8: a second at most."""
 
 ONE_LEVEL_ELEMENTS = 1600
 """Up to this many elements, each shoots for itself; above, patches of 2 x 2 elements shoot."""
@@ -37,8 +39,10 @@ _ELEMENT_BYTES = 3000
 
 def _form_factor_error(elements: int, method: str) -> float:
     """Default accuracy of form factors: what costs nothing is done well."""
-    if elements <= DIRECT_ELEMENTS:
+    if elements <= EXACT_ELEMENTS:
         return 1e-8
+    if elements <= DIRECT_ELEMENTS:
+        return 1e-4
     return 1e-3 if method == "direct" else 0.02
 
 
@@ -226,7 +230,8 @@ def solve(
         record.choices["method"] = f"{method}: {n} elements, direct up to {DIRECT_ELEMENTS}"
     if mesh.patch_count < n and (method == "direct" or n <= ONE_LEVEL_ELEMENTS):
         with record.stage("mesh"):
-            mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=method != "direct")
+            cluster = method != "direct"
+            mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=cluster)
         n = mesh.element_count
         _forecast(scene, n, None, method)
     error = form_factor_error if form_factor_error is not None else _form_factor_error(n, method)
@@ -238,7 +243,8 @@ def solve(
     with record.stage("prepare"):
         bundles = ReceiverBundles(geometry, mesh, _settings(error, rays, seed, mesh.patch_count), count)
     try:
-        if resume is None:
+        if resume is None or method == "direct":
+            # A direct solve has no half-way state to go on from.
             with record.stage("incident light"):
                 incident = incident_irradiance(scene, mesh, bundles.accelerator, seed=seed)
             solution = _start(scene, mesh, incident, record)

@@ -48,7 +48,11 @@ class BoxTree:
         bounds = geometry.piece_bounds
         order = np.arange(len(bounds))
         centre = bounds.mean(axis=1)
-        low, high, skip, first, count = [], [], [], [], []
+        low: list[NDArray[np.float64]] = []
+        high: list[NDArray[np.float64]] = []
+        skip: list[int] = []
+        first: list[int] = []
+        count: list[int] = []
         # Preorder with an explicit stack; (start, stop) ranges of ``order``.
         stack = [(0, len(bounds), -1)] if len(bounds) else []
         while stack:

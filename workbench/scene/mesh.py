@@ -577,7 +577,8 @@ def load_scene(path: str | Path) -> Scene:
     """A mesh file as a scene of three bands, without a camera.
 
     A file that emits nothing is given light, and a note says so: a uniform sky of radiance 1/pi,
-    under which an open horizontal surface has an irradiance of 1 W/m2; or, where the fronts see
+    under which an open horizontal surface has an irradiance of 1 W/m2, and a sun of 1 W/m2 from above
+    and one side, without which open shapes would look flat; or, where the fronts see
     no sky (a closed room), an isotropic point light in the roomiest place found, whose flux in W
     equals the area of the surfaces, so that their mean direct irradiance is 1 W/m2.
 
@@ -627,9 +628,11 @@ def _lit(scene: Scene) -> Scene:
     if (met < 0).mean() > 0.01:
         note = (
             "nothing in the file emits: it is lit by a uniform sky of radiance 1/pi W/(m2 sr), "
-            "1 W/m2 on an open horizontal surface"
+            "1 W/m2 on an open horizontal surface, and a sun of 1 W/m2"
         )
-        return replace(scene, background=np.full(3, 1 / np.pi), notes=(*scene.notes, note))
+        # Above whichever of y and z the file calls up.
+        sun = Light("sun", "directional", np.ones(3), direction=-np.array([0.4, 0.7, 0.6]) / np.sqrt(1.01))
+        return replace(scene, background=np.full(3, 1 / np.pi), lights=(sun,), notes=(*scene.notes, note))
 
     # The middles of 64 chords are places inside; the roomiest has its nearest wall farthest off.
     def reach(origin: FloatArray, along: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
