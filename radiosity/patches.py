@@ -517,6 +517,6 @@ def _area_and_centroid(
     tri, ring = _fans(corners, starts)
     part = 0.5 * np.linalg.norm(np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]), axis=1)
     who = owner[ring]
-    area = np.bincount(who, part, count)
+    area = np.bincount(who, part, count).astype(np.float64)
     centroid = np.stack([np.bincount(who, part * tri.mean(axis=1)[:, k], count) for k in range(3)], axis=1)
     return area, np.ascontiguousarray(centroid / area[:, None])

@@ -787,7 +787,8 @@ def shoot(
         # Shaft from the group to the patch; its candidates serve every element of the group.
         count = _shaft_candidates(
             mesh.patch_bounds[q], flat, mesh.patch_normal[q],
-            mesh.sender_corners[mesh.sender_start[mesh.patch_sender[q]]], mesh.polygon[e0], patch, geo, mesh, work.found, work, tally,
+            mesh.sender_corners[mesh.sender_start[mesh.patch_sender[q]]], mesh.polygon[e0],
+            patch, geo, mesh, work.found, work, tally,
         )  # fmt: skip
         tally[_SHAFT] += 1
         if count == 0:

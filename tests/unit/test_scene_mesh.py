@@ -316,11 +316,14 @@ def test_gltf_nodes_are_placed_and_materials_read(tmp_path):
 # A mesh as a scene
 
 
-def test_a_mesh_without_light_is_lit_by_the_sky(tmp_path):
+def test_a_mesh_without_light_is_lit_by_sky_and_sun(tmp_path):
     scene = load_scene(obj(tmp_path, cube_obj()))
     # A uniform sky of radiance L gives an open horizontal surface pi L.
     assert np.pi * scene.background == pytest.approx(np.ones(3))
-    assert scene.lights == ()
+    (sun,) = scene.lights
+    assert sun.kind == "directional"
+    assert np.linalg.norm(sun.direction) == pytest.approx(1.0)
+    assert sun.direction[1] < 0 and sun.direction[2] < 0  # from above, whichever axis is up
     assert "uniform sky" in scene.notes[-1]
     assert (scene.bands, scene.camera, scene.closed) == (3, None, False)
 

@@ -75,9 +75,7 @@ def objects_of(geometry: Geometry, spheres: ArrayLike | None = None) -> Objects:
     if materials:
         by_surface = np.stack([material.transmittance for material in materials])
         clear[: geometry.piece_count] = by_surface[geometry.polygon_surface[geometry.piece_polygon]]
-    bounds = np.concatenate(
-        [geometry.piece_bounds, np.stack([balls[:, :3] - radius, balls[:, :3] + radius], axis=1)]
-    )
+    bounds = np.concatenate([geometry.piece_bounds, np.stack([balls[:, :3] - radius, balls[:, :3] + radius], axis=1)])
     return Objects(
         corners=np.ascontiguousarray(geometry.corners),
         piece_start=np.ascontiguousarray(geometry.piece_start),
