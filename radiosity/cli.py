@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from radiosity.reproduce import REPRODUCTIONS
 from workbench.errors import InputError, OptionError, WorkbenchError
 
 if TYPE_CHECKING:
@@ -350,6 +351,35 @@ def _short(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return ", ".join(_short(item) for item in value)
     return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+# ---- reproduce --------------------------------------------------------------------------------
+
+
+@main.command()
+@click.argument("name", type=click.Choice(sorted(REPRODUCTIONS)), metavar="NAME")
+@click.option("-o", "--output", "directory", type=click.Path(path_type=Path), metavar="DIR", help="Write files here.")
+@click.option("--quick", is_flag=True, help="A small picture: a look at the shape of the result, not at its seconds.")
+def reproduce(name: str, directory: Path | None, quick: bool) -> None:
+    """Run an experiment of a paper again and print its figures beside ours.
+
+    NAME is camera-table-1 (hardware cameras, Table 1), woo-corner-samples or woo-tori (Woo 1993).
+    DIR gets NAME.csv, NAME.png and record.json.
+    """
+    from workbench.study.result import format_table, write_study
+
+    if directory is None:
+        result = REPRODUCTIONS[name](quick)
+        files: list[Path] = []
+    else:
+        with _writable(directory, None):
+            result = REPRODUCTIONS[name](quick)
+            files = write_study(result, directory)
+    click.echo("\n".join([result.title, "", format_table(result.rows), ""]))
+    for note in result.notes:
+        click.echo(click.wrap_text(f"- {note}", width=110, subsequent_indent="  "))
+    for path in files:
+        click.echo(str(path))
 
 
 # ---- view, scenes, doctor ---------------------------------------------------------------------

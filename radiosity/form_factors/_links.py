@@ -83,6 +83,8 @@ class OccluderArrays(NamedTuple):
     corners: np.ndarray
     piece_start: np.ndarray
     piece_polygon: np.ndarray
+    normal: np.ndarray
+    offset: np.ndarray
     bounds: np.ndarray
     through: np.ndarray
     low: np.ndarray
@@ -147,6 +149,8 @@ def occluder_arrays(geometry: Geometry, tree: BoxTree) -> OccluderArrays:
         geometry.corners,
         geometry.piece_start,
         geometry.piece_polygon,
+        geometry.piece_normal,
+        np.einsum("ij,ij->i", geometry.piece_normal, geometry.corners[geometry.piece_start[:-1]]),
         geometry.piece_bounds,
         np.ascontiguousarray(geometry.polygon_transmittance[geometry.piece_polygon]),
         tree.low,
@@ -275,26 +279,26 @@ def _pick(candidates, many, own, other, piece_polygon, corners, starts, planes, 
     return kept
 
 
-@njit(nogil=True, cache=True, inline="always")
-def _point_share(x, y, z, nx, ny, nz, own, geo, mesh, patch, found, count, limit, work, tally):
-    """Form factor from a point to a patch; ``NEEDS_RAYS`` if more than ``limit`` candidates remain.
+@njit(nogil=True, cache=True)
+def _point_share(
+    x, y, z, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start, sender_normal, corners, starts,
+    piece_polygon, through, slack, found, count, limit, planes, picked, boxes, sizes, weights, cut, tally,
+):  # fmt: skip
+    """Form factor from a point to the sender pieces ``t0..t1``; ``NEEDS_RAYS`` if too many remain.
 
-    ``found[:count]`` are the group's candidates.  Inlined: a call that hands on these
-    tuples of arrays costs more than the work it does.
+    ``found[:count]`` are the group's candidates, of which at most ``limit`` may cross the pyramid.
+    The arrays come one by one: handing on tuples of arrays costs more than the work done here.
     """
     total = 0.0
-    other = mesh.patch_polygon[patch]
-    for s in range(mesh.patch_sender[patch], mesh.patch_sender[patch + 1]):
-        s0, s1 = mesh.sender_start[s], mesh.sender_start[s + 1]
-        share = open_share(x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, mesh.sender_normal, s, geo.slack)
+    for s in range(t0, t1):
+        s0, s1 = sender_start[s], sender_start[s + 1]
+        share = open_share(x, y, z, nx, ny, nz, sender_corners, s0, s1, sender_normal, s, slack)
         if share <= 0.0:
             continue
         tally[_CLOSED] += 1
-        normal = mesh.sender_normal[s]
-        used = light_pyramid(x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, normal, 2.0 * geo.slack, work.planes)
+        used = light_pyramid(x, y, z, nx, ny, nz, sender_corners, s0, s1, sender_normal[s], 2.0 * slack, planes)
         kept = _pick(
-            found, count, own, other, geo.piece_polygon, geo.corners, geo.piece_start, work.planes, used,
-            geo.slack, limit, work.picked, tally,
+            found, count, own, other, piece_polygon, corners, starts, planes, used, slack, limit, picked, tally
         )  # fmt: skip
         if kept == 0:
             tally[_CLEAR] += 1
@@ -304,16 +308,15 @@ def _point_share(x, y, z, nx, ny, nz, own, geo, mesh, patch, found, count, limit
         visible = 0.0
         if kept <= limit:
             visible, pieces = visible_share(
-                x, y, z, nx, ny, nz, mesh.sender_corners, s0, s1, normal, geo.corners, geo.piece_start,
-                geo.through, work.picked, kept, work.boxes, work.sizes, work.weights, work.cut,
+                x, y, z, nx, ny, nz, sender_corners, s0, s1, sender_normal[s], corners, starts, through, picked, kept,
+                boxes, sizes, weights, cut,
             )  # fmt: skip
             tally[_CUT] += 1
             if pieces < 0:
                 tally[_OVERFLOW] += 1
         if pieces < 0:
             tally[_COMPLEX] += 1
-            total = NEEDS_RAYS
-            break
+            return NEEDS_RAYS
         tally[_PIECES] += pieces
         if pieces == 0:
             tally[_DARK] += 1
@@ -354,19 +357,22 @@ def _cell_points(cell, quad, out):
     return 3
 
 
-@njit(nogil=True, cache=True, inline="always")
-def _cell_integral(cell, quad, nx, ny, nz, own, geo, mesh, patch, found, count, limit, work, tally):
+@njit(nogil=True, cache=True)
+def _cell_integral(
+    cell, quad, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start, sender_normal, corners, starts,
+    piece_polygon, through, slack, found, count, limit, points, planes, picked, boxes, sizes, weights, cut, tally,
+):  # fmt: skip
     """Integral of the point form factor over a cell; ``NEEDS_RAYS`` if a point needs them."""
     total = 0.0
-    for k in range(_cell_points(cell, quad, work.points)):
+    for k in range(_cell_points(cell, quad, points)):
         share = _point_share(
-            work.points[k, 0], work.points[k, 1], work.points[k, 2], nx, ny, nz, own, geo, mesh, patch, found,
-            count, limit, work, tally,
+            points[k, 0], points[k, 1], points[k, 2], nx, ny, nz, own, other, t0, t1, sender_corners, sender_start,
+            sender_normal, corners, starts, piece_polygon, through, slack, found, count, limit, planes, picked, boxes,
+            sizes, weights, cut, tally,
         )  # fmt: skip
         if share < 0.0:
-            total = NEEDS_RAYS
-            break
-        total += work.points[k, 3] * share
+            return NEEDS_RAYS
+        total += points[k, 3] * share
     return total
 
 
@@ -417,8 +423,10 @@ def _first_cell(corners, a, b, k, out):
 
 
 @njit(nogil=True, cache=True)
-def element_integral(
-    element, patch, geo, mesh, found, count, limit, tolerance, levels, own, work, tally
+def _element_integral(
+    ring_corners, ring_start, p0, p1, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start, sender_normal,
+    corners, starts, piece_polygon, through, slack, found, count, limit, tolerance, levels, cells, state, points,
+    planes, picked, boxes, sizes, weights, cut, tally,
 ):  # fmt: skip
     """Integral of the point form factor over an element, halving cells until ``tolerance`` is met.
 
@@ -426,15 +434,18 @@ def element_integral(
     compared with its four quarters.  Returns (integral, error estimate); the integral is
     ``NEEDS_RAYS`` if some point has too many candidates.
     """
-    nx, ny, nz = mesh.normal[element, 0], mesh.normal[element, 1], mesh.normal[element, 2]
     total = error = 0.0
-    cells, state = work.cells, work.state
-    for piece in range(mesh.element_piece[element], mesh.element_piece[element + 1]):
-        a, b = mesh.piece_start[piece], mesh.piece_start[piece + 1]
+    parent = cells[79]
+    for piece in range(p0, p1):
+        a, b = ring_start[piece], ring_start[piece + 1]
         fans = 1 if b - a == 4 else b - a - 2
         for k in range(fans):
-            quad = _first_cell(mesh.corners, a, b, k, cells[0])
-            value = _cell_integral(cells[0], quad, nx, ny, nz, own, geo, mesh, patch, found, count, limit, work, tally)
+            quad = _first_cell(ring_corners, a, b, k, cells[0])
+            value = _cell_integral(
+                cells[0], quad, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start, sender_normal, corners,
+                starts, piece_polygon, through, slack, found, count, limit, points, planes, picked, boxes, sizes,
+                weights, cut, tally,
+            )  # fmt: skip
             if value < 0.0:
                 return NEEDS_RAYS, 0.0
             if levels == 0:
@@ -446,7 +457,6 @@ def element_integral(
             while top >= 0:
                 value, allowed, level = state[top, 0], state[top, 1], state[top, 2]
                 # The cell's own row becomes its last quarter, so quarters are made from a copy.
-                parent = cells[79]
                 for i in range(4):
                     for axis in range(3):
                         parent[i, axis] = cells[top, i, axis]
@@ -454,8 +464,10 @@ def element_integral(
                 for q in range(4):
                     _child(parent, quad, q, cells[top + q])
                     part = _cell_integral(
-                        cells[top + q], quad, nx, ny, nz, own, geo, mesh, patch, found, count, limit, work, tally
-                    )
+                        cells[top + q], quad, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start,
+                        sender_normal, corners, starts, piece_polygon, through, slack, found, count, limit, points,
+                        planes, picked, boxes, sizes, weights, cut, tally,
+                    )  # fmt: skip
                     if part < 0.0:
                         return NEEDS_RAYS, 0.0
                     state[top + q, 0] = part
@@ -566,11 +578,27 @@ def _reverse_integral(
     return total
 
 
+@njit(nogil=True, cache=True)
+def _on_one_side(nx, ny, nz, d, rings, p0, p1, q0, q1, slack):
+    """Whether two polygons of ``rings`` lie on the same side of a plane, touching it at most."""
+    lowest, highest = math.inf, -math.inf
+    for i in range(p0, p1):
+        off = nx * rings[i, 0] + ny * rings[i, 1] + nz * rings[i, 2] - d
+        lowest = min(lowest, off)
+        highest = max(highest, off)
+    for i in range(q0, q1):
+        off = nx * rings[i, 0] + ny * rings[i, 1] + nz * rings[i, 2] - d
+        lowest = min(lowest, off)
+        highest = max(highest, off)
+    return lowest >= -slack or highest <= slack
+
+
 @njit(nogil=True, cache=True, inline="always")
-def _shaft_candidates(box, flat, normal, corner, own, patch, geo, mesh, found, work, tally):
+def _shaft_candidates(box, flat, normal, corner, own, group, patch, geo, mesh, found, work, tally):
     """Pieces that may come between a box of receivers and a patch; -1 if there are too many.
 
-    ``normal`` and ``corner`` give the plane of ``flat`` receivers, ``own`` their polygon.
+    ``normal`` and ``corner`` give the plane of ``flat`` receivers, ``own`` their polygon, ``group`` the
+    patch to which they belong.
     """
     used = box_shaft(box[0], box[1], mesh.patch_bounds[patch, 0], mesh.patch_bounds[patch, 1], work.shaft)
     flat_sender = mesh.patch_polygon[patch] >= 0
@@ -605,6 +633,15 @@ def _shaft_candidates(box, flat, normal, corner, own, patch, geo, mesh, found, w
             if outside_planes(
                 geo.corners, geo.piece_start[piece], geo.piece_start[piece + 1], work.shaft, used, geo.slack
             ):
+                tally[_SCULL] += 1
+                continue
+            # A wall that has both ends in front of it (or both behind) comes between neither.
+            if flat and flat_sender and _on_one_side(
+                geo.normal[piece, 0], geo.normal[piece, 1], geo.normal[piece, 2], geo.offset[piece],
+                mesh.sender_corners, mesh.sender_start[mesh.patch_sender[group]],
+                mesh.sender_start[mesh.patch_sender[group + 1]], mesh.sender_start[mesh.patch_sender[patch]],
+                mesh.sender_start[mesh.patch_sender[patch + 1]], geo.slack,
+            ):  # fmt: skip
                 tally[_SCULL] += 1
                 continue
             found[kept] = piece
@@ -788,7 +825,7 @@ def shoot(
         count = _shaft_candidates(
             mesh.patch_bounds[q], flat, mesh.patch_normal[q],
             mesh.sender_corners[mesh.sender_start[mesh.patch_sender[q]]], mesh.polygon[e0],
-            patch, geo, mesh, work.found, work, tally,
+            q, patch, geo, mesh, work.found, work, tally,
         )  # fmt: skip
         tally[_SHAFT] += 1
         if count == 0:
@@ -835,7 +872,7 @@ def shoot(
                     work.box[1, axis] = mesh.element_bounds[e, 1, axis]
                 many = _shaft_candidates(
                     work.box, True, mesh.normal[e], mesh.corners[mesh.piece_start[mesh.element_piece[e]]],
-                    mesh.polygon[e], patch, geo, mesh, work.near, work, tally,
+                    mesh.polygon[e], q, patch, geo, mesh, work.near, work, tally,
                 )  # fmt: skip
                 tally[_SHAFT] += 1
                 candidates = work.near
@@ -850,13 +887,17 @@ def shoot(
                     tally[_COMPLEX] += 1
                     continue
             allowed = (error * open_factor + floor) * area
-            own = mesh.polygon[e]
             depth = levels
             if open_factor < floor:
                 depth = 0  # too faint to be worth a second look
-            value, doubt = element_integral(
-                e, patch, geo, mesh, candidates, many, limit, allowed, depth, own, work, tally
-            )
+            value, doubt = _element_integral(
+                mesh.corners, mesh.piece_start, mesh.element_piece[e], mesh.element_piece[e + 1], mesh.normal[e, 0],
+                mesh.normal[e, 1], mesh.normal[e, 2], mesh.polygon[e], mesh.patch_polygon[patch],
+                mesh.patch_sender[patch], mesh.patch_sender[patch + 1], mesh.sender_corners, mesh.sender_start,
+                mesh.sender_normal, geo.corners, geo.piece_start, geo.piece_polygon, geo.through, geo.slack,
+                candidates, many, limit, allowed, depth, work.cells, work.state, work.points, work.planes, work.picked,
+                work.boxes, work.sizes, work.weights, work.cut, tally,
+            )  # fmt: skip
             if value < 0.0:
                 factor[e] = open_factor
                 rays[e] = True

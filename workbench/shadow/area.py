@@ -39,13 +39,17 @@ def cut_workspace() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 @njit(nogil=True, cache=True)
-def _cone_planes(occluder, count, planes):
-    """Planes through the origin and each edge, unit normals pointing into the cone; their number."""
+def _cone_planes(occluder, count, reach, planes):
+    """Planes through the origin and each edge, unit normals pointing into the cone.
+
+    Returns their number; 0 for an occluder seen edge on, whose cone is flat and hides nothing.
+    """
     cx = cy = cz = 0.0
     for i in range(count):
         cx += occluder[i, 0]
         cy += occluder[i, 1]
         cz += occluder[i, 2]
+    flat = 1e-14 * count * reach
     used = 0
     for i in range(count):
         j = i + 1 if i + 1 < count else 0
@@ -57,7 +61,10 @@ def _cone_planes(occluder, count, planes):
         length = math.sqrt(qx * qx + qy * qy + qz * qz)
         if length == 0.0:
             continue  # an edge seen end on bounds nothing
-        if qx * cx + qy * cy + qz * cz < 0.0:
+        inside = (qx * cx + qy * cy + qz * cz) / length
+        if abs(inside) <= flat:
+            return 0
+        if inside < 0.0:
             length = -length
         planes[used, 0], planes[used, 1], planes[used, 2] = qx / length, qy / length, qz / length
         used += 1
@@ -104,31 +111,26 @@ def visible_share(
         m = b - a
         if m > MAX_CORNERS:
             return 0.0, -1
+        lowest, highest = math.inf, -math.inf
         for i in range(m):
             relative[i, 0] = corners[a + i, 0] - x
             relative[i, 1] = corners[a + i, 1] - y
             relative[i, 2] = corners[a + i, 2] - z
+            off = mx * relative[i, 0] + my * relative[i, 1] + mz * relative[i, 2]
+            lowest = min(lowest, off)
+            highest = max(highest, off)
         # Only what lies between the point and the sender's plane can block.
-        m = clip_by_plane(relative, m, mx, my, mz, 0.0, near, low)
-        if m > 0:
-            m = clip_by_plane(low, m, -mx, -my, -mz, -height, near, clipped)
-        if m < 0:
-            return 0.0, -1
-        if m == 0:
+        blocker = relative
+        if lowest < near or highest > height - near:
+            m = clip_by_plane(relative, m, mx, my, mz, 0.0, near, low)
+            if m > 0:
+                m = clip_by_plane(low, m, -mx, -my, -mz, -height, near, clipped)
+            if m < 0:
+                return 0.0, -1
+            blocker = clipped
+        used = _cone_planes(blocker, m, reach, planes) if m > 0 else 0
+        if used == 0:
             continue
-        # Edge on: a flat cone hides nothing.
-        ax = ay = az = 0.0
-        ox, oy, oz = clipped[0, 0], clipped[0, 1], clipped[0, 2]
-        for i in range(1, m - 1):
-            ux, uy, uz = clipped[i, 0] - ox, clipped[i, 1] - oy, clipped[i, 2] - oz
-            vx, vy, vz = clipped[i + 1, 0] - ox, clipped[i + 1, 1] - oy, clipped[i + 1, 2] - oz
-            ax += uy * vz - uz * vy
-            ay += uz * vx - ux * vz
-            az += ux * vy - uy * vx
-        area = math.sqrt(ax * ax + ay * ay + az * az)
-        if area == 0.0 or abs(ax * ox + ay * oy + az * oz) <= 1e-14 * area * reach:
-            continue
-        used = _cone_planes(clipped, m, planes)
         tau = through[index]
         other = 1 - current
         made = 0

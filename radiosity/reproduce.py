@@ -1,0 +1,45 @@
+"""Experiments of the papers, run again by ``radiosity reproduce NAME``.
+
+A reproduction is a function of ``quick`` that returns a
+:class:`~workbench.study.result.StudyResult`; a new one is one function here and one line in
+:data:`REPRODUCTIONS`.  Each imports what it needs when it is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from workbench.study.result import StudyResult
+
+__all__ = ["REPRODUCTIONS", "camera_table_1", "woo_corner_samples", "woo_tori"]
+
+
+def woo_tori(quick: bool) -> StudyResult:
+    """Woo's tori: the plane-vertex check on soft shadows by K = 8 and by 3 to 17 rays."""
+    from workbench.study.tori import tori_study
+
+    return tori_study(width=160, height=120) if quick else tori_study()
+
+
+def woo_corner_samples(quick: bool) -> StudyResult:
+    """Woo's cast rays of pixel corners, row by row, with the plane-vertex check of each row."""
+    from workbench.study.corner_samples import corner_study
+
+    return corner_study(width=160, height=120) if quick else corner_study()
+
+
+def camera_table_1(quick: bool) -> StudyResult:
+    """Table 1 of the hardware-camera paper: shadow rays against cameras, seconds and error."""
+    from workbench.study.camera_table import camera_study
+
+    return camera_study(width=24, height=18) if quick else camera_study()
+
+
+REPRODUCTIONS: dict[str, Callable[[bool], StudyResult]] = {
+    "camera-table-1": camera_table_1,
+    "woo-corner-samples": woo_corner_samples,
+    "woo-tori": woo_tori,
+}
+"""By the names of the command line."""
