@@ -1,0 +1,1 @@
+"""Studies: experiments of the papers run again, and what each technique saved."""
