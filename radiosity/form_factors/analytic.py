@@ -188,8 +188,8 @@ def polygon_to_polygon(
     sender_holes, receiver_holes : sequence of (m, 3) float
         Rings cut out.
     error : float
-        Wanted error, relative to F.  Rounding limits it to about 1e-13, to 1e-10 for polygons ten
-        thousand times as long as wide.
+        Wanted error, relative to F.  Rounding limits it to about 1e-13, and to 1e-9 for polygons a
+        hundred thousand times as long as wide.
 
     Returns
     -------
