@@ -217,7 +217,7 @@ def tori_study(
             bundle = float(np.median(spent[light + loop]))
             shadow = float(np.median(before_bundle)) + bundle
             overall = float(np.median(cast)) + shadow
-            row = {
+            row: dict[str, Any] = {
                 "light": light,
                 "loop": loop.removeprefix(": "),
                 "points": len(found.shots),
