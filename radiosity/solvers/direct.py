@@ -11,15 +11,19 @@ from numpy.typing import NDArray
 from radiosity.form_factors.bundle import ReceiverBundles
 from radiosity.solvers.solution import Progress, ProgressEvent, Solution
 
-__all__ = ["balance_rows", "solve_direct"]
+__all__ = ["COVERED", "balance_rows", "solve_direct"]
 
 FloatArray = NDArray[np.float64]
 
 COLUMNS_A_STEP = 32
+COVERED = 0.5
+"""Row sum below which an element of a closed scene counts as covered (the floor under a box), not as in error."""
 
 
 def balance_rows(exchange: FloatArray, areas: FloatArray, rounds: int = 200) -> FloatArray:
     """Scale exchange areas so that each row of form factors sums to 1, keeping reciprocity.
+
+    Rows that sum to less than :data:`COVERED` are left as they are: such an element sees hardly anything.
 
     The symmetric matrix S is scaled to ``x_i x_j S_ij`` with row sums ``A_i`` (cf. J. van Leersum,
     "A method for determining a consistent set of radiation view factors", 1989; here by symmetric
@@ -38,8 +42,9 @@ def balance_rows(exchange: FloatArray, areas: FloatArray, rounds: int = 200) -> 
     (n, n) float
     """
     x = np.ones(len(areas))
+    open_rows = exchange.sum(axis=1) >= COVERED * areas
     for _ in range(rounds):
-        ratio = areas / np.maximum(x * (exchange @ x), 1e-300)
+        ratio = np.divide(areas, x * (exchange @ x), out=np.ones(len(areas)), where=open_rows)
         x *= np.sqrt(ratio)
         if np.abs(ratio - 1.0).max() < 1e-14:
             break

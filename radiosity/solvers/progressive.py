@@ -2,10 +2,12 @@
 
 M. F. Cohen, S. E. Chen, J. R. Wallace and D. P. Greenberg, "A progressive refinement approach to
 fast radiosity image generation" (SIGGRAPH 1988), on patches that shoot and elements that receive,
-with the receiver bundles of Wallace, Elmquist and Haines (1989).  Two departures:
+with the receiver bundles of Wallace, Elmquist and Haines (1989).  Three departures:
 
 * patches are shot a few at a time, so that threads have work (the batch never depends on how many
   threads there are);
+* in a scene declared closed, a patch's form factors are scaled to carry all that it shoots; near
+  reflectance 1 a row sum's small error would else be multiplied by 1 / (1 - rho);
 * form factors already found are kept while memory lasts, and once every patch that can send has
   been shot, what is left to bounce is solved at once on the patches.  Near reflectance 1 shooting
   alone would need thousands of rounds.
@@ -19,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radiosity.form_factors.bundle import ReceiverBundles
+from radiosity.solvers.direct import COVERED
 from radiosity.solvers.solution import Progress, ProgressEvent, Solution
 from workbench.memory import available_bytes
 
@@ -129,8 +132,8 @@ def shoot_until(
     cache: dict[int, FloatArray] = {}
     room = int(CACHE_SHARE * available_bytes() / (8 * mesh.element_count))
     can_send = np.maximum.reduceat(mesh.reflectance.max(axis=1), mesh.patch_start[:-1]) > 0
-    sums: list[FloatArray] = []
-    doubts: list[FloatArray] = []
+    sums: list[float] = []
+    doubts: list[float] = []
     known: set[int] = set()
     solution.converged, solution.stopped = False, "interrupted"
     try:
@@ -165,13 +168,17 @@ def shoot_until(
                 with record.stage("form factors"):
                     columns = bundles.columns(fresh, _floors(solution, fresh, bundles.settings.error))
                 for row, patch in enumerate(fresh.tolist()):
-                    rows[patch] = columns.factor[row]
-                    if len(cache) < room:
-                        cache[patch] = columns.factor[row]
+                    factor = columns.factor[row]
+                    row_sum = float(factor @ mesh.element_area / mesh.patch_area[patch])
                     if patch not in known:
                         known.add(patch)
-                        sums.append(columns.factor[row] @ mesh.element_area / mesh.patch_area[patch])
-                        doubts.append(columns.spread[row] @ mesh.element_area / mesh.patch_area[patch])
+                        sums.append(row_sum)
+                        doubts.append(float(columns.spread[row] @ mesh.element_area / mesh.patch_area[patch]))
+                    if solution.scene.closed and row_sum >= COVERED:
+                        factor = factor / row_sum  # in an enclosure all that is shot arrives
+                    rows[patch] = factor
+                    if len(cache) < room:
+                        cache[patch] = factor
             with record.stage("shoot"):
                 _shoot(solution, batch, np.stack([rows[p] for p in batch.tolist()]))
             record.counters.add(shots=len(batch))
