@@ -1,0 +1,863 @@
+"""The recursive tracer, in wavefronts: all rays of one depth of the ray trees at a time.
+
+T. Whitted's recursion (CACM 23(6), 1980) turned into batches: find the closest hits, send shadow
+rays to every light, then go on with all reflected and refracted rays as one batch.  Lights are the
+scene's own (point, spot, directional, linear) and every surface that emits; linear and area lights
+take ``light_samples`` shadow rays.  Quantities are radiometric: radiance in W/(m2 sr), a diffuse
+surface under irradiance E sends rho E / pi, a highlight is the energy-conserving Phong lobe
+(e + 1) / (2 pi) cos^e around the mirrored direction, which is also the lobe of fuzzy reflection.
+An emitting surface makes no highlight: reflected rays see it themselves.
+
+Departures from physics, as in the ray tracers of the papers: no Fresnel terms (mirror and
+transparent shares are constants), shadow rays pass transparent surfaces unbent.
+
+The tracer both records and obeys :mod:`workbench.render.atomic`: see :class:`RayTrees` and
+:class:`Guide` there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from workbench.accel.base import NO_POLYGON
+from workbench.accel.embree import EmbreeAccelerator
+from workbench.arrays import as_bands, as_points, as_unit_vectors
+from workbench.counters import Counters
+from workbench.errors import InputError, OptionError
+from workbench.geometry.flat import Geometry
+from workbench.render import _trace_kernels as kernels
+from workbench.render._trace_kernels import COMPLEX_SHADOW
+from workbench.render.atomic import NO_SURFACE, Guide, RayTrees, bilinear
+from workbench.render.textures import Texture
+from workbench.scene.model import Light, Scene, Surface
+
+__all__ = ["ComponentCount", "RayTally", "TraceOptions", "Traced", "Tracer"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+BLOCK_RAYS = 16384
+"""Samples a block: their wavefront stays in cache."""
+
+MAX_CROSSINGS = 64
+"""Transparent surfaces that a shadow ray passes; beyond, it counts as blocked."""
+
+
+@dataclass(frozen=True)
+class TraceOptions:
+    """How to trace.
+
+    Parameters
+    ----------
+    depth : int
+        Reflections and refractions in a row, 3 in the paper.
+    light_samples : int
+        Shadow rays to a linear or area light.
+    jitter : bool
+        Move the samples of a light by a random number a point.  Off, penumbras show steps of
+        1/K; on, noise, which adaptive sampling takes for detail.
+    bundle : int
+        Rays of a fuzzy reflection or refraction at the cast ray's hit (deeper ones take one);
+        1 traces the sharp direction whatever the exponent.
+    falloff : bool
+        Whether light of point and spot lights falls with the square of distance.
+    see_backs : bool
+        Whether one-sided surfaces are seen from behind, black; off, rays to the eye pass there, as
+        NFF scenes expect.  Shadow rays are blocked from both sides all the same.
+    ambient : (bands,) float
+        Radiance from everywhere, never shadowed; times the reflectance. [W m-2 sr-1]
+    seed : int
+        Of all random numbers.
+    """
+
+    depth: int = 3
+    light_samples: int = 8
+    jitter: bool = False
+    bundle: int = 1
+    falloff: bool = True
+    see_backs: bool = True
+    ambient: ArrayLike = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.depth <= 16:
+            raise OptionError(f"depth: found {self.depth}, expected 0 to 16")
+        for name in ("light_samples", "bundle"):
+            if not 1 <= getattr(self, name) <= 4096:
+                raise OptionError(f"{name}: found {getattr(self, name)}, expected 1 to 4096")
+
+
+@dataclass
+class ComponentCount:
+    """One component's rays: samples that ``assumed``, rays ``shot``, rays ``saved`` by assuming.
+
+    A reflected or refracted ray saved counts 1; what would have followed it is not known.
+    """
+
+    assumed: int = 0
+    shot: int = 0
+    saved: int = 0
+
+    def add(self, other: ComponentCount) -> None:
+        """Add the counts of another."""
+        self.assumed += other.assumed
+        self.shot += other.shot
+        self.saved += other.saved
+
+
+@dataclass
+class RayTally:
+    """Rays by component, shadow rays by light."""
+
+    shadows: list[ComponentCount]
+    cast: ComponentCount = field(default_factory=ComponentCount)
+    reflection: ComponentCount = field(default_factory=ComponentCount)
+    refraction: ComponentCount = field(default_factory=ComponentCount)
+    cast_hits: int = 0
+    cast_misguided: int = 0
+
+    def add(self, other: RayTally) -> None:
+        """Add the counts of another tally over the same lights."""
+        for mine, theirs in zip(self.shadows, other.shadows, strict=True):
+            mine.add(theirs)
+        for name in ("cast", "reflection", "refraction"):
+            getattr(self, name).add(getattr(other, name))
+        self.cast_hits += other.cast_hits
+        self.cast_misguided += other.cast_misguided
+
+    @property
+    def shadow(self) -> ComponentCount:
+        """All lights together."""
+        total = ComponentCount()
+        for light in self.shadows:
+            total.add(light)
+        return total
+
+    @property
+    def rays(self) -> int:
+        """Rays shot of every kind."""
+        return sum(part.shot for part in (self.cast, self.shadow, self.reflection, self.refraction))
+
+    def counters(self) -> Counters:
+        """The tally by the workbench's names."""
+        return Counters(
+            rays=self.rays,
+            cast_rays=self.cast.shot,
+            shadow_rays=self.shadow.shot,
+            reflection_rays=self.reflection.shot,
+            refraction_rays=self.refraction.shot,
+            cast_rays_saved=self.cast.saved,
+            shadow_rays_saved=self.shadow.saved,
+            reflection_rays_saved=self.reflection.saved,
+            refraction_rays_saved=self.refraction.saved,
+        )
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What rays brought back.
+
+    Parameters
+    ----------
+    radiance : (n, bands) float
+        [W m-2 sr-1]
+    surface : (n,) int
+        Surface met by each ray, -1 for none.
+    saved : (n,) int
+        Shadow rays of the sample's ray tree not shot because their answer was assumed.
+    tally : RayTally
+    """
+
+    radiance: FloatArray
+    surface: IntArray
+    saved: IntArray
+    tally: RayTally
+
+
+@dataclass(frozen=True)
+class _Emitter:
+    """A light as the kernels read it; see :func:`~workbench.render._trace_kernels.light_rays`."""
+
+    law: int
+    power: FloatArray
+    samples: int
+    corners: FloatArray
+    cumulative: FloatArray
+    normals: FloatArray
+    scale: float
+    cosine_cut: float = -2.0
+    spot_exponent: float = 0.0
+    falls: bool = True
+    highlight: bool = True
+
+
+def _of_light(light: Light, options: TraceOptions) -> _Emitter:
+    """A light that is no surface."""
+
+    def given(name: str) -> FloatArray:
+        value = getattr(light, name)
+        if value is None:
+            raise InputError(f"light {light.name!r}: found no {name}, expected one for a {light.kind} light")
+        return as_points(value, f"light {light.name!r}, {name}")
+
+    if light.kind in ("point", "spot"):
+        spot = light.kind == "spot"
+        return _Emitter(
+            law=kernels.POINT,
+            power=light.power,
+            samples=1,
+            corners=given("position")[None],
+            cumulative=np.ones(1),
+            normals=as_unit_vectors(given("direction")) if spot else np.zeros((1, 3)),
+            scale=1.0,
+            cosine_cut=math.cos(math.radians(light.cone_deg)) if spot else -2.0,
+            spot_exponent=light.exponent,
+            falls=options.falloff,
+        )
+    if light.kind == "directional":
+        toward = -as_unit_vectors(given("direction"))
+        return _Emitter(kernels.DIRECTIONAL, light.power, 1, toward[None], np.ones(1), np.zeros((1, 3)), 1.0)
+    if light.kind != "linear":
+        raise InputError(f"light {light.name!r}: found the kind {light.kind!r}, expected a kind that the tracer knows")
+    ends = np.concatenate([given("position"), given("end")])
+    axis = ends[1:] - ends[:1]
+    length = float(np.linalg.norm(axis))
+    return _Emitter(
+        law=kernels.LINEAR_LAMBERTIAN if light.lambertian else kernels.LINEAR,
+        power=light.power,
+        samples=options.light_samples,
+        corners=ends[None],
+        cumulative=np.ones(1),
+        normals=axis / length,
+        scale=length / options.light_samples,
+    )
+
+
+def _of_surface(surface: Surface, options: TraceOptions) -> _Emitter:
+    """An emitting surface: an area light."""
+    geometry = Geometry.from_scene(Scene(surface.name, (surface,)))
+    triangles, _ = geometry.triangles
+    vector = 0.5 * np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = np.linalg.norm(vector, axis=1)
+    return _Emitter(
+        law=kernels.AREA,
+        power=surface.material.emission / np.pi,
+        samples=options.light_samples,
+        corners=triangles,
+        cumulative=np.cumsum(area) / area.sum(),
+        normals=vector / area[:, None],
+        scale=float(area.sum()) / options.light_samples,
+        highlight=False,
+    )
+
+
+class _Materials:
+    """The surfaces' materials as arrays, a row a surface."""
+
+    def __init__(self, scene: Scene) -> None:
+        materials = [surface.material for surface in scene.surfaces]
+        shape = (len(materials), scene.bands)
+
+        def rows(name: str) -> FloatArray:
+            return np.asarray([getattr(material, name) for material in materials], dtype=np.float64).reshape(shape)
+
+        self.reflectance = rows("reflectance")
+        self.radiance = rows("emission") / np.pi
+        self.specular = rows("specular")
+        self.transmittance = rows("transmittance")
+        self.exponent = np.asarray([material.exponent for material in materials], dtype=np.float64)
+        self.ior = np.asarray([material.ior for material in materials], dtype=np.float64)
+        self.mirrors = np.asarray(self.specular.any(axis=1))
+        self.clear = np.asarray(self.transmittance.any(axis=1))
+        # What lets light through has no dark side.
+        self.both_sides = np.asarray([m.two_sided for m in materials], dtype=bool) | self.clear
+        # Highlights: a perfect mirror shows no point light, and exponent -1 says so to the kernel.
+        self.highlight_exponent = np.where(self.mirrors & np.isfinite(self.exponent), self.exponent, -1.0)
+        self.emits = self.radiance.any(axis=1)
+
+
+def _corner_normals(scene: Scene, geometry: Geometry) -> FloatArray:
+    """Normals at the corners of the geometry's triangles (t, 3, 3); empty if no surface is smooth."""
+    if all(surface.vertex_normals is None for surface in scene.surfaces):
+        return np.empty((0, 3, 3))
+    at_corners = np.repeat(geometry.piece_normal, np.diff(geometry.piece_start), axis=0)
+    piece_surface = geometry.polygon_surface[geometry.piece_polygon]
+    corner_surface = np.repeat(piece_surface, np.diff(geometry.piece_start))
+    first = np.searchsorted(corner_surface, np.arange(len(scene.surfaces) + 1))
+    for index, surface in enumerate(scene.surfaces):
+        if surface.vertex_normals is None:
+            continue
+        part = slice(first[index], first[index + 1])
+        corners = geometry.corners[part]
+        normals = surface.vertex_normals[surface.ring_vertices]
+        if corners.shape != normals.shape or (corners != surface.vertices[surface.ring_vertices]).any():
+            normals = _matched_normals(surface, corners)  # concave faces were cut and their corners moved about
+        at_corners[part] = normals
+    counts = np.diff(geometry.piece_start) - 2
+    start = np.repeat(geometry.piece_start[:-1], counts)
+    step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.ascontiguousarray(at_corners[np.stack([start, start + step + 1, start + step + 2], axis=1)])
+
+
+def _matched_normals(surface: Surface, corners: FloatArray) -> FloatArray:
+    """Normals of the vertices that lie where ``corners`` (n, 3) do; at creases the last one counts."""
+    assert surface.vertex_normals is not None
+    found = {tuple(v): normal for v, normal in zip(surface.vertices.tolist(), surface.vertex_normals, strict=True)}
+    return np.asarray([found[tuple(corner)] for corner in corners.tolist()])
+
+
+class Tracer:
+    """A scene ready to be traced.
+
+    Parameters
+    ----------
+    scene : Scene
+    options : TraceOptions, optional
+    textures : mapping of str to Texture, optional
+        By the names of surfaces; each multiplies its surface's reflectance.
+    workers : int
+        Threads over which blocks of samples are spread.  Answers and counts do not depend on it.
+
+    Attributes
+    ----------
+    light_names : tuple of str
+        The scene's lights, then its emitting surfaces: the order of the tally's ``shadows``.
+
+    Raises
+    ------
+    InputError
+        If a texture is given for an unknown surface or a light has an unknown kind.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        options: TraceOptions | None = None,
+        *,
+        textures: Mapping[str, Texture] | None = None,
+        workers: int = 1,
+    ) -> None:
+        if workers < 1:
+            raise OptionError(f"workers: found {workers}, expected 1 or more")
+        self.scene, self.options, self.workers = scene, options or TraceOptions(), workers
+        self.bands = scene.bands
+        self._ambient = as_bands(self.options.ambient, self.bands, "ambient")
+        names = [surface.name for surface in scene.surfaces]
+        unknown = sorted(set(textures or {}) - set(names))
+        if unknown:
+            raise InputError(f"textures: found {unknown[0]!r}, expected the name of a surface")
+        self._textures = {i: textures[name] for i, name in enumerate(names) if name in textures} if textures else {}
+        self._materials = _Materials(scene)
+        self._geometry = Geometry.from_scene(scene)
+        triangles, piece = self._geometry.triangles
+        polygon = self._geometry.piece_polygon[piece]
+        self._triangles = triangles
+        self._first_triangle = np.searchsorted(polygon, np.arange(self._geometry.polygon_count + 1))
+        self._corner_normals = _corner_normals(scene, self._geometry)
+        self._surface = np.append(self._geometry.polygon_surface, NO_SURFACE).astype(np.int32)
+        self._all = EmbreeAccelerator(self._geometry)
+        self.offset = self._all.offset
+        self._set_up_shadows()
+        emitting = [surface for surface in scene.surfaces if surface.material.emission.any()]
+        shining = [light for light in scene.lights if light.power.any()]
+        self._lights = [_of_light(light, self.options) for light in shining]
+        self._lights += [_of_surface(surface, self.options) for surface in emitting]
+        self.light_names = tuple(
+            [light.name for light in scene.lights if light.power.any()] + [s.name for s in emitting]
+        )
+
+    def _set_up_shadows(self) -> None:
+        clear: NDArray[np.bool_] = self._materials.clear
+        self._panes: EmbreeAccelerator | None = None
+        self._opaque = self._all
+        if not clear.any():
+            return
+        surfaces = self.scene.surfaces
+
+        def part(wanted: bool) -> Geometry:
+            chosen = tuple(s for s, c in zip(surfaces, clear, strict=True) if c == wanted)
+            return Geometry.from_scene(replace(self.scene, surfaces=chosen))
+
+        self._opaque = EmbreeAccelerator(part(False))
+        panes = part(True)
+        self._panes = EmbreeAccelerator(panes)
+        through = self._materials.transmittance[clear]
+        self._pane_transmittance = through[panes.polygon_surface]
+
+    @property
+    def light_count(self) -> int:
+        """Number of lights."""
+        return len(self._lights)
+
+    def ray_trees(self, count: int, *, whole_tree: bool = False, normals: bool = False) -> RayTrees:
+        """Room to record ``count`` samples: the top of each ray tree, or every node to the depth limit."""
+        nodes = 2 ** (self.options.depth + 1) - 1 if whole_tree else 1
+        return RayTrees.empty(count, nodes, self.light_count, self.bands, normals)
+
+    def trace(
+        self,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        *,
+        keys: IntArray | None = None,
+        record: RayTrees | None = None,
+        guide: Guide | None = None,
+        guide_rows: IntArray | None = None,
+        place: tuple[FloatArray, FloatArray] | None = None,
+    ) -> Traced:
+        """Radiance along rays.
+
+        Parameters
+        ----------
+        origins : (n, 3) or (3,) float
+        directions : (n, 3) float
+            Unit vectors.
+        keys : (n,) int, optional
+            Number of each ray from which its random numbers come; 0, 1, 2... unless given.
+        record : RayTrees, optional
+            Written, row i by ray i: corner samples.
+        guide : Guide, optional
+            What may be assumed: samples inside pixels.
+        guide_rows : (n,) int
+            Row of the guide for each ray; with ``guide``.
+        place : pair of (n,) float
+            Where in its pixel each ray passes, 0..1 to the right and downward; with ``guide``.
+
+        Raises
+        ------
+        InputError
+            If shapes do not agree or values are not finite.
+        """
+        along = as_unit_vectors(directions, "directions")
+        count = len(along)
+        start = as_points(origins, "origins")
+        if len(start) not in (1, count):
+            raise InputError(f"origins and directions: found {len(start)} and {count} rows, expected as many")
+        start = np.ascontiguousarray(np.broadcast_to(start, along.shape))
+        number = np.arange(count) if keys is None else np.asarray(keys)
+        salted = kernels.child_keys(number.astype(np.uint64), self.options.seed, 1)
+        guided = None
+        if guide is not None:
+            if guide_rows is None or place is None:
+                raise InputError("guide: found no guide_rows or place, expected both")
+            guided = _Guided(guide, np.asarray(guide_rows), *place)
+        radiance = np.empty((count, self.bands))
+        surface = np.empty(count, dtype=np.int64)
+        saved = np.zeros(count, dtype=np.int64)
+
+        def work(rows: slice) -> RayTally:
+            wave = _Wave(
+                start[rows],
+                along[rows],
+                salted[rows],
+                np.arange(rows.stop - rows.start),
+                np.zeros(rows.stop - rows.start, dtype=np.int64),
+            )
+            sweep = _Sweep(
+                self,
+                RayTally([ComponentCount() for _ in self._lights]),
+                None if record is None else record.rows(rows),
+                None if guided is None else guided.rows(rows),
+                surface[rows],
+                saved[rows],
+            )
+            radiance[rows] = sweep.follow(wave, 0)
+            return sweep.tally
+
+        blocks = [slice(i, min(i + BLOCK_RAYS, count)) for i in range(0, count, BLOCK_RAYS)]
+        if self.workers > 1 and len(blocks) > 1:
+            with ThreadPoolExecutor(self.workers) as pool:
+                tallies = list(pool.map(work, blocks))
+        else:
+            tallies = [work(rows) for rows in blocks]
+        tally = RayTally([ComponentCount() for _ in self._lights])
+        for part in tallies:
+            tally.add(part)
+        return Traced(radiance, surface, saved, tally)
+
+    # ---- what the sweep asks of the scene
+
+    def transmitted(self, origins: NDArray, directions: NDArray) -> FloatArray:
+        """Share (n, bands or 1) that passes along shadow rays, in the opaque part's unit coordinates."""
+        blocked = self._opaque.blocked_raw(origins, directions, np.ones(len(origins), dtype=np.float32)) == 0
+        through = (~blocked).astype(np.float64)[:, None]
+        if self._panes is None:
+            return through
+        through = np.repeat(through, self.bands, axis=1)
+        centre, unit = self._opaque.frame
+        rows = np.flatnonzero(~blocked)
+        start = origins[rows].astype(np.float64) / unit + centre
+        rest = directions[rows].astype(np.float64) / unit
+        for _ in range(MAX_CROSSINGS):
+            if len(rows) == 0:
+                return through
+            hits = self._panes.closest_hit(start, rest, far=1.0)
+            met = hits.polygon != NO_POLYGON
+            rows, start, rest, t = rows[met], start[met], rest[met], hits.t[met]
+            through[rows] *= self._pane_transmittance[hits.polygon[met]]
+            # On from just beyond the pane.
+            length = np.linalg.norm(rest, axis=1)
+            step = t + self.offset / length
+            go_on = (step < 1.0) & through[rows].any(axis=1)
+            rows, start, rest, step = rows[go_on], start[go_on], rest[go_on], step[go_on]
+            start = start + step[:, None] * rest
+            rest = rest * (1.0 - step)[:, None]
+        through[rows] = 0.0
+        return through
+
+
+@dataclass(frozen=True)
+class _Guided:
+    """A guide, and where in it each sample stands."""
+
+    guide: Guide
+    row: IntArray
+    x: FloatArray
+    y: FloatArray
+
+    def rows(self, rows: slice) -> _Guided:
+        return _Guided(self.guide, self.row[rows], self.x[rows], self.y[rows])
+
+
+@dataclass(frozen=True)
+class _Wave:
+    """All rays of one depth: origins and directions (n, 3), keys, their samples and tree nodes.
+
+    A node of -1 is beyond what is recorded.
+    """
+
+    origins: FloatArray
+    directions: FloatArray
+    keys: NDArray[np.uint64]
+    sample: IntArray
+    node: IntArray
+
+
+@dataclass(frozen=True)
+class _Found:
+    """The hits of a wave, a row a ray that met something; ``ray`` is its row in the wave."""
+
+    ray: IntArray
+    surface: NDArray[np.int32]
+    points: FloatArray
+    facing: FloatArray
+    shading: FloatArray
+    front: NDArray[np.bool_]
+    directions: FloatArray
+    agreed: NDArray[np.bool_] | None
+
+
+class _Sweep:
+    """One block of samples on its way through the scene."""
+
+    def __init__(
+        self,
+        tracer: Tracer,
+        tally: RayTally,
+        record: RayTrees | None,
+        guided: _Guided | None,
+        surface: IntArray,
+        saved: IntArray,
+    ) -> None:
+        self.tracer, self.tally, self.record, self.guided = tracer, tally, record, guided
+        self.surface, self.saved = surface, saved
+        if record is not None:
+            self.nodes = record.nodes
+        else:
+            self.nodes = guided.guide.surface.shape[1] if guided is not None else 0
+
+    def follow(self, wave: _Wave, depth: int) -> FloatArray:
+        """Radiance (n, bands) along the rays of a wave."""
+        tracer = self.tracer
+        radiance = np.broadcast_to(tracer.scene.background, (len(wave.sample), tracer.bands)).copy()
+        found = self._hits(wave, depth)
+        if self.record is not None:
+            self._note_surfaces(wave, found)
+        if len(found.ray) == 0:
+            return radiance
+        materials = tracer._materials
+        surface = found.surface
+        lit = found.front | materials.both_sides[surface]
+        reflectance = materials.reflectance[surface]
+        for index, texture in tracer._textures.items():
+            rows = np.flatnonzero(surface == index)
+            if len(rows):
+                reflectance[rows] *= texture(found.points[rows])
+        mirrored = kernels.mirror(found.directions, found.shading, found.facing)
+        leaving = reflectance * tracer._ambient
+        leaving += materials.radiance[surface]
+        self._light(wave, found, lit, reflectance, mirrored, leaving)
+        leaving[~lit] = 0.0
+        if depth < tracer.options.depth:
+            self._go_on(wave, found, lit, mirrored, leaving, depth)
+        radiance[found.ray] = leaving
+        return radiance
+
+    # ---- hits
+
+    def _hits(self, wave: _Wave, depth: int) -> _Found:
+        tracer = self.tracer
+        count = len(wave.sample)
+        t = np.full(count, np.inf)
+        points, facing, shading = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
+        front = np.zeros(count, dtype=bool)
+        polygon = np.full(count, NO_POLYGON, dtype=np.int64)
+
+        def locate(rows: IntArray | slice, must_contain: bool) -> None:
+            part = (t[rows], points[rows], facing[rows], shading[rows], front[rows])
+            kernels.locate(
+                wave.origins[rows], wave.directions[rows], polygon[rows], tracer._first_triangle, tracer._triangles,
+                tracer._corner_normals, must_contain, tracer.offset, *part,
+            )  # fmt: skip
+            if not isinstance(rows, slice):
+                t[rows], points[rows], facing[rows], shading[rows], front[rows] = part
+
+        left: IntArray | slice = slice(None)
+        if depth == 0 and self.guided is not None and "cast" in self.guided.guide.options.components:
+            polygon[:] = self.guided.guide.polygon[self.guided.row]
+            tried = np.flatnonzero(polygon != NO_POLYGON)
+            locate(tried, True)
+            self.tally.cast.assumed += len(tried)
+            left = np.flatnonzero(np.isinf(t))
+            self.tally.cast.saved += count - len(left)
+            self.tally.cast_misguided += len(tried) - (count - len(left))
+        rest = np.arange(count)[left]
+        if len(rest):
+            hits = tracer._all.closest_hit(wave.origins[rest], wave.directions[rest])
+            polygon[rest] = hits.polygon
+            if depth == 0:
+                self.tally.cast.shot += len(rest)
+            met = rest[hits.polygon != NO_POLYGON]
+            locate(slice(None) if len(met) == count else met, False)
+            if not tracer.options.see_backs:
+                self._pass_backs(wave, met, t, polygon, front, locate)
+        surface = tracer._surface[polygon]
+        if depth == 0:
+            self.surface[:] = surface
+            if self.record is not None:
+                self.record.polygon[:] = polygon
+        ray = np.flatnonzero(np.isfinite(t))
+        if depth == 0:
+            self.tally.cast_hits += len(ray)
+        agreed: NDArray[np.bool_] | None = None
+        if self.guided is not None:
+            node = wave.node[ray]
+            agreed = node >= 0
+            # Node 0 stands in for none; the mask above rules it out.
+            agreed &= self.guided.guide.agrees(
+                self.guided.row[wave.sample[ray]], np.maximum(node, 0), surface[ray], shading[ray]
+            )
+        if len(ray) == count:
+            return _Found(ray, surface, points, facing, shading, front, wave.directions, agreed)
+        return _Found(
+            ray, surface[ray], points[ray], facing[ray], shading[ray], front[ray], wave.directions[ray], agreed
+        )
+
+    def _pass_backs(
+        self,
+        wave: _Wave,
+        met: IntArray,
+        t: FloatArray,
+        polygon: IntArray,
+        front: NDArray[np.bool_],
+        locate: Callable[[IntArray, bool], None],
+    ) -> None:
+        """Lead rays that met the back of a one-sided surface on to what is behind."""
+        tracer = self.tracer
+        one_sided = np.append(~tracer._materials.both_sides, False)
+        while True:
+            behind = met[np.isfinite(t[met]) & ~front[met] & one_sided[tracer._surface[polygon[met]]]]
+            if len(behind) == 0:
+                return
+            gone = t[behind] + tracer.offset
+            start = wave.origins[behind] + gone[:, None] * wave.directions[behind]
+            hits = tracer._all.closest_hit(start, wave.directions[behind])
+            polygon[behind] = hits.polygon
+            t[behind] = np.inf
+            met = behind[hits.polygon != NO_POLYGON]
+            locate(met, False)
+
+    def _note_surfaces(self, wave: _Wave, found: _Found) -> None:
+        assert self.record is not None
+        recorded = wave.node >= 0
+        self.record.surface[wave.sample[recorded], wave.node[recorded]] = NO_SURFACE
+        met = recorded[found.ray]
+        at = (wave.sample[found.ray[met]], wave.node[found.ray[met]])
+        self.record.surface[at] = found.surface[met]
+        if self.record.normal is not None:
+            self.record.normal[at] = found.shading[met]
+
+    # ---- lights
+
+    def _light(
+        self,
+        wave: _Wave,
+        found: _Found,
+        lit: NDArray[np.bool_],
+        reflectance: FloatArray,
+        mirrored: FloatArray,
+        leaving: FloatArray,
+    ) -> None:
+        """Add the light of every light to ``leaving`` (n, bands)."""
+        tracer, count = self.tracer, len(found.ray)
+        exponent = tracer._materials.highlight_exponent[found.surface]
+        shiny = bool((exponent >= 0.0).any())
+        sample, node = wave.sample[found.ray], wave.node[found.ray]
+        centre, unit = tracer._opaque.frame
+        bands = 1 if tracer._panes is None else tracer.bands
+        keys = wave.keys[found.ray]
+        nobody = np.full(count, COMPLEX_SHADOW, dtype=np.uint8)
+        recorded = np.flatnonzero(node >= 0)
+        for index, light in enumerate(tracer._lights):
+            tally = self.tally.shadows[index]
+            assumed = nobody
+            if self.guided is not None and found.agreed is not None:
+                state = self.guided.guide.state[self.guided.row[sample], np.maximum(node, 0), index]
+                assumed = np.where(found.agreed, state, COMPLEX_SHADOW).astype(np.uint8)
+            targets, axes = self._targets(light, index, keys)
+            size = count * light.samples
+            direct, shine = np.zeros((count, bands)), np.zeros((count, bands))
+            seen, out_of_cone = np.empty(count, dtype=np.int64), np.empty(count, dtype=bool)
+            origin, along = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
+            weight, lobe_weight, owner = np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
+            rays = kernels.light_rays(
+                light.law, targets, axes, light.scale, light.cosine_cut, light.spot_exponent, light.falls,
+                light.highlight and shiny, tracer.offset, centre, unit,
+                found.points, found.facing, found.shading, mirrored, exponent, lit, assumed,
+                direct, shine, seen, out_of_cone, origin, along, weight, lobe_weight, owner,
+            )  # fmt: skip
+            through = tracer.transmitted(origin[:rays], along[:rays])
+            states = np.empty(count, dtype=np.uint8)
+            kernels.gather_light(
+                rays, through, weight, lobe_weight, owner, lit, assumed, seen, out_of_cone, direct, shine, states
+            )
+            tally.shot += rays
+            leaving += reflectance / np.pi * direct * light.power
+            if shiny and light.highlight:
+                leaving += tracer._materials.specular[found.surface] * shine * light.power
+            if self.record is not None:
+                self.record.state[sample[recorded], node[recorded], index] = states[recorded]
+            if self.guided is not None:
+                self._note_saved(assumed, lit, seen, sample, tally)
+
+    def _note_saved(
+        self,
+        assumed: NDArray[np.uint8],
+        lit: NDArray[np.bool_],
+        seen: IntArray,
+        sample: IntArray,
+        tally: ComponentCount,
+    ) -> None:
+        """Count the shadow rays that an assumed state spared: one a sample above the horizon."""
+        rays = np.where((assumed != COMPLEX_SHADOW) & lit, seen, 0)
+        tally.assumed += int((rays > 0).sum())
+        tally.saved += int(rays.sum())
+        self.saved += np.bincount(sample, weights=rays, minlength=len(self.saved)).astype(np.int64)
+
+    def _targets(self, light: _Emitter, index: int, keys: NDArray[np.uint64]) -> tuple[FloatArray, FloatArray]:
+        if light.samples == 1 and light.law in (kernels.POINT, kernels.DIRECTIONAL):
+            return light.corners[:, :1], light.normals[None]
+        jitter = self.tracer.options.jitter
+        shape = (len(keys) if jitter else 1, light.samples, 3)
+        targets, axes = np.empty(shape), np.empty(shape)
+        kernels.light_targets(
+            light.law, light.corners, light.cumulative, light.normals, keys, 1000 + 2 * index, light.samples, jitter,
+            targets, axes,
+        )  # fmt: skip
+        return targets, axes
+
+    # ---- reflection and refraction
+
+    def _go_on(
+        self,
+        wave: _Wave,
+        found: _Found,
+        lit: NDArray[np.bool_],
+        mirrored: FloatArray,
+        leaving: FloatArray,
+        depth: int,
+    ) -> None:
+        """Add what reflected and refracted rays bring, all of them one wave."""
+        materials = self.tracer._materials
+        reflecting = np.flatnonzero(materials.mirrors[found.surface] & lit)
+        passing = np.flatnonzero(materials.clear[found.surface])
+        reflecting = self._interpolate("reflection", wave, found, reflecting, materials.specular, leaving)
+        passing = self._interpolate("refraction", wave, found, passing, materials.transmittance, leaving)
+        if len(reflecting) + len(passing) == 0:
+            return
+        bent, inside = kernels.refract(
+            found.directions[passing], found.shading[passing], found.facing[passing], found.front[passing],
+            materials.ior[found.surface[passing]],
+        )  # fmt: skip
+        bundle = self.tracer.options.bundle
+        copies = bundle if depth == 0 else 1
+        waves = []
+        for branch, rows, along, side in (
+            (1, reflecting, mirrored[reflecting], np.ones(len(reflecting))),
+            (2, passing, bent, np.where(inside, 1.0, -1.0)),
+        ):
+            ray = found.ray[rows]
+            node = 2 * wave.node[ray] + branch
+            keys = kernels.child_keys(wave.keys[ray], branch, 1)
+            if bundle > 1:
+                exponents = materials.exponent[found.surface[rows]]
+                along = kernels.lobe(along, exponents, found.facing[rows], keys, copies)
+            start = found.points[rows] + (side * self.tracer.offset)[:, None] * found.facing[rows]
+            if copies > 1:
+                start = np.repeat(start, copies, axis=0)
+                keys = kernels.child_keys(keys, 3, copies)
+            # A bundle has no one node below it.
+            node = np.where((wave.node[ray] >= 0) & (node < self.nodes) & (copies == 1), node, -1)
+            waves.append(_Wave(start, along, keys, np.repeat(wave.sample[ray], copies), np.repeat(node, copies)))
+        self.tally.reflection.shot += len(waves[0].sample)
+        self.tally.refraction.shot += len(waves[1].sample)
+        both = _Wave(
+            np.concatenate([waves[0].origins, waves[1].origins]),
+            np.concatenate([waves[0].directions, waves[1].directions]),
+            np.concatenate([waves[0].keys, waves[1].keys]),
+            np.concatenate([waves[0].sample, waves[1].sample]),
+            np.concatenate([waves[0].node, waves[1].node]),
+        )
+        radiance = self.follow(both, depth + 1).reshape(-1, copies, self.tracer.bands)
+        brought = radiance.mean(axis=1) if copies > 1 else radiance[:, 0]
+        for name, rows, values, share in (
+            ("reflected", reflecting, brought[: len(reflecting)], materials.specular),
+            ("refracted", passing, brought[len(reflecting) :], materials.transmittance),
+        ):
+            leaving[rows] += share[found.surface[rows]] * values
+            if self.record is not None:
+                ray = found.ray[rows]
+                recorded = wave.node[ray] >= 0
+                at = (wave.sample[ray[recorded]], wave.node[ray[recorded]])
+                getattr(self.record, name)[at] = values[recorded]
+
+    def _interpolate(
+        self, component: str, wave: _Wave, found: _Found, rows: IntArray, share: FloatArray, leaving: FloatArray
+    ) -> IntArray:
+        """Add what may be interpolated between the corners; returns the rows that need a ray."""
+        if self.guided is None or found.agreed is None or component not in self.guided.guide.options.components:
+            return rows
+        guide = self.guided.guide
+        spreads = guide.reflection_spread if component == "reflection" else guide.refraction_spread
+        corners = guide.reflected if component == "reflection" else guide.refracted
+        rows_agreed = rows[found.agreed[rows]]
+        ray = found.ray[rows_agreed]
+        pixel, node = self.guided.row[wave.sample[ray]], wave.node[ray]
+        most = share[found.surface[rows_agreed]].max(axis=1)
+        alike = spreads[pixel, node] * most <= guide.options.similar  # NaN, a missing ray, is not alike
+        chosen, ray = rows_agreed[alike], ray[alike]
+        sample = wave.sample[ray]
+        values = bilinear(corners[pixel[alike], node[alike]], self.guided.x[sample], self.guided.y[sample])
+        leaving[chosen] += share[found.surface[chosen]] * values
+        tally: ComponentCount = getattr(self.tally, component)
+        tally.assumed += len(chosen)
+        tally.saved += len(chosen) * (self.tracer.options.bundle if np.all(wave.node == 0) else 1)
+        keep = np.ones(len(leaving), dtype=bool)
+        keep[chosen] = False
+        return rows[keep[rows]]
