@@ -219,7 +219,7 @@ def _apply_shares(elements, starts, weights, blocked, factor, spread):
             w = weights[k]
             total += w
             square += w * w
-            if not blocked[k]:
+            if blocked[k] != 0:
                 seen += w
         if total <= 0.0:
             # No pair faced the other: a grazing glance at most; half of it, in doubt as a whole.
@@ -327,7 +327,7 @@ class ReceiverBundles:
                 self.accelerator.offset, centre, scale, starts, origins, directions, weights,
             )  # fmt: skip
             clock = time.perf_counter()
-            blocked = self.accelerator.blocked_unit(origins[:used], directions[:used], np.ones(used, dtype=np.float32))
+            blocked = self.accelerator.blocked_raw(origins[:used], directions[:used], np.ones(used, dtype=np.float32))
             seconds += time.perf_counter() - clock
             traced += used
             _apply_shares(elements[block], starts, weights, blocked, factor, spread)

@@ -137,7 +137,7 @@ class EmbreeAccelerator:
 
         def work(block: slice) -> None:
             start, along = self._unit(rays.origins[block], rays.directions[block])
-            blocked[block] = self.blocked_unit(start, along, rays.far[block].astype(np.float32))
+            blocked[block] = self.blocked_raw(start, along, rays.far[block].astype(np.float32)) == 0
 
         if len(self._polygon):
             self._run(work, len(rays))
@@ -149,11 +149,11 @@ class EmbreeAccelerator:
         """Centre (3,) and scale that take scene coordinates to Embree's unit ones."""
         return self._centre, self._scale
 
-    def blocked_unit(self, origins: NDArray, directions: NDArray, far: NDArray) -> NDArray[np.bool_]:
-        """Occlusion of rays made in unit coordinates as float32, for kernels; counts nothing.
+    def blocked_raw(self, origins: NDArray, directions: NDArray, far: NDArray) -> NDArray[np.int32]:
+        """Embree's own answer for rays made in unit coordinates as float32: 0 blocked, -1 clear.
 
-        ``far`` (n,) float32 is overwritten by Embree.
+        For kernels, which keep their own counts.  ``far`` (n,) float32 is overwritten by Embree.
         """
         if len(self._polygon) == 0:
-            return np.zeros(len(origins), dtype=bool)
-        return np.asarray(self._scene.run(origins, directions, dists=far, query="OCCLUDED")) == 0
+            return np.full(len(origins), -1, dtype=np.int32)
+        return np.asarray(self._scene.run(origins, directions, dists=far, query="OCCLUDED"))

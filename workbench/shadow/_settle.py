@@ -1,0 +1,271 @@
+"""Kernels that settle the occlusion of points for one polygonal sender, cheap tests first.
+
+Tile by tile a shaft, then point by point the light pyramid; what has no candidate is lit, what has a
+few is cut exactly, what has many is left COMPLEX for rays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from workbench.accel.box_tree import boxes_meeting_planes
+from workbench.culling.plane_vertex import light_pyramid, outside_planes
+from workbench.culling.shaft import MAX_SHAFT_PLANES, box_shaft
+from workbench.geometry.lambert import lambert_piece
+from workbench.shadow.area import MAX_CORNERS, MAX_PIECES, visible_share
+
+MAX_CANDIDATES = 256
+"""Longest candidate list that a tile hands down."""
+SPLIT_DEPTH = 7
+"""Most halvings of a sender whose exact cut has too many pieces."""
+
+# Rows of the tally, names of workbench.counters.
+TALLY = (
+    "box_tests",
+    "shafts",
+    "shafts_empty",
+    "shaft_tests",
+    "shaft_culls",
+    "horizon_culls",
+    "plane_vertex_checks",
+    "plane_vertex_culls",
+    "not_inshadow",
+    "inshadow",
+    "complex_shadow",
+    "closed_forms",
+    "exact_cuts",
+    "exact_pieces",
+    "exact_overflows",
+)
+_BOX, _SHAFT, _EMPTY, _STEST, _SCULL, _HORIZON, _CHECK, _CULL, _CLEAR, _DARK, _COMPLEX, _CLOSED, _CUT, _PIECES, _OVER = (
+    range(len(TALLY))
+)
+
+UNKNOWN, CLEAR, DARK, COMPLEX, EXACT = 0, 1, 2, 3, 4
+
+
+@njit(nogil=True, cache=True)
+def tile_candidates(
+    bounds_of, normal, offset, own, first, last, ring, sender_low, sender_high, sender_normal, sender_own, corners,
+    starts, piece_polygon, low, high, skip, head, leaf, order, bounds, slack, lists, counts, tally,
+):  # fmt: skip
+    """Candidates of the shafts from tiles ``first..last`` to a sender; count -1 for a long list.
+
+    ``normal`` (t, 3) and ``offset`` (t,) are the plane of each tile, or a zero normal for a tile
+    that is not flat; ``ring`` (k, 3) are the sender's corners, ``own`` (t,) each tile's polygon.
+    """
+    planes = np.empty((MAX_SHAFT_PLANES, 4))
+    found = np.empty(MAX_CANDIDATES, dtype=np.int64)
+    for t in range(first, last):
+        used = box_shaft(bounds_of[t, 0], bounds_of[t, 1], sender_low, sender_high, planes)
+        flat = normal[t, 0] != 0.0 or normal[t, 1] != 0.0 or normal[t, 2] != 0.0
+        if flat:
+            planes[used, 0], planes[used, 1], planes[used, 2] = normal[t, 0], normal[t, 1], normal[t, 2]
+            planes[used, 3] = offset[t]
+            used += 1
+        planes[used, 0], planes[used, 1], planes[used, 2] = sender_normal[0], sender_normal[1], sender_normal[2]
+        planes[used, 3] = (
+            sender_normal[0] * ring[0, 0] + sender_normal[1] * ring[0, 1] + sender_normal[2] * ring[0, 2]
+        )
+        used += 1
+        # Irradiance is an integral: what only touches the shaft hides a null set.
+        for k in range(used):
+            planes[k, 3] += 2.0 * slack
+        tally[_SHAFT] += 1
+        many = boxes_meeting_planes(low, high, skip, head, leaf, order, bounds, planes, used, slack, found, tally)
+        if many > MAX_CANDIDATES:
+            counts[t] = -1
+            continue
+        kept = 0
+        for i in range(many):
+            piece = found[i]
+            if (flat and piece_polygon[piece] == own[t]) or piece_polygon[piece] == sender_own:
+                continue
+            tally[_STEST] += 1
+            if outside_planes(corners, starts[piece], starts[piece + 1], planes, used, slack):
+                tally[_SCULL] += 1
+                continue
+            lists[t, kept] = piece
+            kept += 1
+        counts[t] = kept
+        if kept == 0:
+            tally[_EMPTY] += 1
+
+
+@njit(nogil=True, cache=True)
+def settle_points(
+    points, normals, own, tile_start, first, last, sender, s0, s1, sender_normal, sender_own, corners, starts,
+    piece_polygon, through, low, high, skip, head, leaf, order, bounds, slack, limit, lists, counts, share, open_share,
+    state, tally,
+):  # fmt: skip
+    """Settle the points of tiles ``first..last`` for one convex sender piece.
+
+    ``open_share`` gets the unoccluded form factor of each point, ``share`` the visible one where it
+    is known, ``state`` CLEAR, DARK, EXACT or COMPLEX.  At most ``limit`` candidates are cut.
+    """
+    planes = np.empty((64, 4))
+    # Boxes that meet the pyramid: so many more than can be cut, and the point is for rays anyway.
+    found = np.empty(4 * limit, dtype=np.int64)
+    picked = np.empty(limit + 1, dtype=np.int64)
+    boxes = np.empty((2, MAX_PIECES, MAX_CORNERS, 3))
+    sizes = np.zeros((2, MAX_PIECES), dtype=np.int64)
+    weights = np.empty((2, MAX_PIECES))
+    cut = np.empty((4, MAX_CORNERS, 3))
+    mx, my, mz = sender_normal[0], sender_normal[1], sender_normal[2]
+    level = mx * sender[s0, 0] + my * sender[s0, 1] + mz * sender[s0, 2]
+    for t in range(first, last):
+        for i in range(tile_start[t], tile_start[t + 1]):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+            value = 0.0
+            if mx * x + my * y + mz * z - level > 1e-3 * slack:
+                value = lambert_piece(x, y, z, nx, ny, nz, sender, s0, s1)
+                tally[_CLOSED] += 1
+            if value <= 0.0:
+                tally[_HORIZON] += 1
+                open_share[i], share[i], state[i] = 0.0, 0.0, DARK
+                continue
+            open_share[i], share[i], state[i] = value, value, CLEAR
+            if counts[t] == 0:
+                tally[_CLEAR] += 1
+                continue
+            used = light_pyramid(x, y, z, nx, ny, nz, sender, s0, s1, sender_normal, 2.0 * slack, planes)
+            many = counts[t]
+            if many < 0:
+                many = boxes_meeting_planes(
+                    low, high, skip, head, leaf, order, bounds, planes, used, slack, found, tally
+                )
+            kept = 0
+            if counts[t] < 0 and many > found.shape[0]:
+                kept = limit + 1
+            else:
+                for c in range(many):
+                    piece = found[c] if counts[t] < 0 else lists[t, c]
+                    if piece_polygon[piece] == own[i] or piece_polygon[piece] == sender_own:
+                        continue
+                    tally[_CHECK] += 1
+                    if outside_planes(corners, starts[piece], starts[piece + 1], planes, used, slack):
+                        tally[_CULL] += 1
+                        continue
+                    picked[kept] = piece
+                    kept += 1
+                    if kept > limit:
+                        break
+            if kept == 0:
+                tally[_CLEAR] += 1
+                continue
+            pieces = -1
+            if kept <= limit:
+                visible, pieces = visible_share(
+                    x, y, z, nx, ny, nz, sender, s0, s1, sender_normal, corners, starts, through, picked, kept,
+                    boxes, sizes, weights, cut,
+                )  # fmt: skip
+                tally[_CUT] += 1
+                if pieces < 0:
+                    tally[_OVER] += 1
+            if pieces < 0:
+                tally[_COMPLEX] += 1
+                state[i] = COMPLEX
+                continue
+            tally[_PIECES] += pieces
+            share[i], state[i] = min(visible, value), EXACT
+            if pieces == 0:
+                tally[_DARK] += 1
+                state[i] = DARK
+
+
+@njit(nogil=True, cache=True)
+def exact_points(
+    chosen, points, normals, own, sender, s0, s1, sender_normal, sender_own, corners, starts, piece_polygon, through,
+    low, high, skip, head, leaf, order, bounds, slack, share, doubt, tally,
+):  # fmt: skip
+    """Cut the sender exactly at ``chosen`` points however many candidates there are.
+
+    Where a cut would leave too many pieces the sender is quartered and each part cut by its own
+    candidates; a part still too crowded after ``SPLIT_DEPTH`` quarterings counts half, its half is
+    added to ``doubt``.
+    """
+    planes = np.empty((64, 4))
+    found = np.empty(4096, dtype=np.int64)
+    boxes = np.empty((2, MAX_PIECES, MAX_CORNERS, 3))
+    sizes = np.zeros((2, MAX_PIECES), dtype=np.int64)
+    weights = np.empty((2, MAX_PIECES))
+    cut = np.empty((4, MAX_CORNERS, 3))
+    stack = np.empty((3 * SPLIT_DEPTH + 8, 4, 3))
+    depth = np.empty(3 * SPLIT_DEPTH + 8, dtype=np.int64)
+    part = np.empty((4, 3))
+    for row in range(chosen.shape[0]):
+        i = chosen[row]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        total = unsure = 0.0
+        # Triangles with a fourth corner equal to the third: one layout for quads and fans.
+        for k in range(s0 + 1, s1 - 1):
+            for axis in range(3):
+                stack[0, 0, axis] = sender[s0, axis]
+                stack[0, 1, axis] = sender[k, axis]
+                stack[0, 2, axis] = sender[k + 1, axis]
+            depth[0] = 0
+            top = 0
+            while top >= 0:
+                for c in range(3):
+                    for axis in range(3):
+                        part[c, axis] = stack[top, c, axis]
+                here = depth[top]
+                top -= 1
+                whole = lambert_piece(x, y, z, nx, ny, nz, part, 0, 3)
+                tally[_CLOSED] += 1
+                if whole <= 0.0:
+                    continue
+                used = light_pyramid(x, y, z, nx, ny, nz, part, 0, 3, sender_normal, 2.0 * slack, planes)
+                many = boxes_meeting_planes(
+                    low, high, skip, head, leaf, order, bounds, planes, used, slack, found, tally
+                )
+                kept = 0
+                if many <= found.shape[0]:
+                    for c in range(many):
+                        piece = found[c]
+                        if piece_polygon[piece] == own[i] or piece_polygon[piece] == sender_own:
+                            continue
+                        tally[_CHECK] += 1
+                        if outside_planes(corners, starts[piece], starts[piece + 1], planes, used, slack):
+                            tally[_CULL] += 1
+                            continue
+                        found[kept] = piece
+                        kept += 1
+                if many <= found.shape[0] and kept == 0:
+                    total += whole
+                    continue
+                pieces = -1
+                if many <= found.shape[0] and kept <= 64:
+                    visible, pieces = visible_share(
+                        x, y, z, nx, ny, nz, part, 0, 3, sender_normal, corners, starts, through, found, kept,
+                        boxes, sizes, weights, cut,
+                    )  # fmt: skip
+                    tally[_CUT] += 1
+                if pieces >= 0:
+                    tally[_PIECES] += pieces
+                    total += min(visible, whole)
+                    continue
+                tally[_OVER] += 1
+                if here >= SPLIT_DEPTH:
+                    total += 0.5 * whole
+                    unsure += 0.5 * whole
+                    continue
+                for q in range(4):
+                    top += 1
+                    depth[top] = here + 1
+                    for axis in range(3):
+                        a, b, d = part[0, axis], part[1, axis], part[2, axis]
+                        ab, bd, da = 0.5 * (a + b), 0.5 * (b + d), 0.5 * (d + a)
+                        if q == 0:
+                            stack[top, 0, axis], stack[top, 1, axis], stack[top, 2, axis] = a, ab, da
+                        elif q == 1:
+                            stack[top, 0, axis], stack[top, 1, axis], stack[top, 2, axis] = ab, b, bd
+                        elif q == 2:
+                            stack[top, 0, axis], stack[top, 1, axis], stack[top, 2, axis] = da, bd, d
+                        else:
+                            stack[top, 0, axis], stack[top, 1, axis], stack[top, 2, axis] = ab, bd, da
+        share[i] = total
+        doubt[i] = unsure
