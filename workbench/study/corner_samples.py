@@ -103,7 +103,7 @@ def corner_hits(grid: VoxelGrid, rays: PinholeRays, *, check: bool = True) -> Co
         grid.objects, grid.cells, np.ascontiguousarray(rays.eye), directions, skip, planes, ids.mailbox, t, polygon,
         counts,
     )  # fmt: skip
-    return CornerHits(Hits(t, polygon), Counters(**dict(zip(COUNTED, counts, strict=True))))
+    return CornerHits(Hits(t, polygon), Counters(**dict(zip(COUNTED, counts.tolist(), strict=True))))
 
 
 def spheres_scene(*, facet_error: float = 0.008, width: int = 640, height: int = 480) -> Scene:
