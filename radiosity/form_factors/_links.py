@@ -407,6 +407,13 @@ def _child(cell, quad, k, out):
 
 
 @njit(nogil=True, cache=True)
+def _cell_area(cell, quad):
+    """Area of a planar cell."""
+    x, y, z = newell_normal(cell, 0, 4 if quad else 3)
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@njit(nogil=True, cache=True)
 def _first_cell(corners, a, b, k, out):
     """Cell ``k`` of a convex ring: the quad itself, or triangle ``k`` of its fan."""
     if b - a == 4:
@@ -473,6 +480,25 @@ def _element_integral(
                     state[top + q, 0] = part
                     quarters += part
                 difference = abs(quarters - value)
+                if quarters == 0.0 and value == 0.0:
+                    # Every point dark: a lit sliver along the rim would show at a corner first, for
+                    # the umbra of a convex occluder is convex.
+                    glimpse = 0.0
+                    for c in range(4 if quad else 3):
+                        for axis in range(3):
+                            middle = 0.25 * (parent[0, axis] + parent[1, axis] + parent[2, axis] + parent[3, axis])
+                            if not quad:
+                                middle = (parent[0, axis] + parent[1, axis] + parent[2, axis]) / 3.0
+                            points[0, axis] = parent[c, axis] + 1e-6 * (middle - parent[c, axis])
+                        seen = _point_share(
+                            points[0, 0], points[0, 1], points[0, 2], nx, ny, nz, own, other, t0, t1, sender_corners,
+                            sender_start, sender_normal, corners, starts, piece_polygon, through, slack, found, count,
+                            limit, planes, picked, boxes, sizes, weights, cut, tally,
+                        )  # fmt: skip
+                        if seen < 0.0:
+                            return NEEDS_RAYS, 0.0
+                        glimpse = max(glimpse, seen)
+                    difference = 0.25 * glimpse * _cell_area(parent, quad)
                 if difference <= 4.0 * allowed or level + 1.0 >= levels:
                     total += quarters
                     error += 0.25 * difference

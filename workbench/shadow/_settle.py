@@ -38,11 +38,25 @@ TALLY = (
     "exact_pieces",
     "exact_overflows",
 )
-_BOX, _SHAFT, _EMPTY, _STEST, _SCULL, _HORIZON, _CHECK, _CULL, _CLEAR, _DARK, _COMPLEX, _CLOSED, _CUT, _PIECES, _OVER = (
-    range(len(TALLY))
-)
+(
+    _BOX,
+    _SHAFT,
+    _EMPTY,
+    _STEST,
+    _SCULL,
+    _HORIZON,
+    _CHECK,
+    _CULL,
+    _CLEAR,
+    _DARK,
+    _COMPLEX,
+    _CLOSED,
+    _CUT,
+    _PIECES,
+    _OVER,
+) = range(len(TALLY))
 
-UNKNOWN, CLEAR, DARK, COMPLEX, EXACT = 0, 1, 2, 3, 4
+CLEAR, DARK, COMPLEX, EXACT = 1, 2, 3, 4
 
 
 @njit(nogil=True, cache=True)
@@ -65,9 +79,7 @@ def tile_candidates(
             planes[used, 3] = offset[t]
             used += 1
         planes[used, 0], planes[used, 1], planes[used, 2] = sender_normal[0], sender_normal[1], sender_normal[2]
-        planes[used, 3] = (
-            sender_normal[0] * ring[0, 0] + sender_normal[1] * ring[0, 1] + sender_normal[2] * ring[0, 2]
-        )
+        planes[used, 3] = sender_normal[0] * ring[0, 0] + sender_normal[1] * ring[0, 1] + sender_normal[2] * ring[0, 2]
         used += 1
         # Irradiance is an integral: what only touches the shaft hides a null set.
         for k in range(used):
