@@ -873,7 +873,7 @@ def shoot(
         for e in range(e0, e1):
             gap = box_distance(mesh.centroid, e, mesh.patch_bounds, patch)
             area = mesh.area[e]
-            open_factor, doubt = _clear_factor(
+            open_factor, open_doubt = _clear_factor(
                 e, patch, gap, flat, flat_sender, geo, mesh, error, floor, closed_forms, work, tally
             )
             if open_factor <= 0.0:
@@ -882,7 +882,7 @@ def shoot(
             tally[_LINK] += 1
             if count == 0:
                 factor[e] = open_factor
-                spread[e] = doubt
+                spread[e] = open_doubt
                 continue
             candidates, many = work.found, count
             if not (flat and flat_sender):
@@ -905,7 +905,7 @@ def shoot(
                 if many == 0:
                     tally[_EMPTY] += 1
                     factor[e] = open_factor
-                    spread[e] = doubt
+                    spread[e] = open_doubt
                     continue
                 if many < 0 or many > 4 * limit:
                     factor[e] = open_factor
@@ -934,7 +934,7 @@ def shoot(
                 if depth == 0:
                     # One rule of four points and no second look: the doubt of four samples.
                     share = factor[e] / open_factor
-                    spread[e] = 0.5 * open_factor * math.sqrt(share * (1.0 - share))
+                    spread[e] = 0.5 * open_factor * math.sqrt(share * (1.0 - share)) + share * open_doubt
 
 
 @njit(nogil=True, cache=True)
