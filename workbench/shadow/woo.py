@@ -46,6 +46,7 @@ from workbench.geometry.polygons import check_polygon, is_convex, vector_area
 __all__ = [
     "LightOcclusion",
     "MARGIN",
+    "adaptive_area_occlusion",
     "adaptive_linear_occlusion",
     "irradiance_weights",
     "light_occlusion",
@@ -205,6 +206,109 @@ def _adaptive_loop(
                 for band in range(bands):
                     mean = 0.5 * (through[lower, band] + through[upper, band])
                     occlusion[row, band] += (1.0 - mean) * (upper - lower) / spans
+        # All K ids are spent, however many rays were shot: a culled polygon holds the last of them.
+        current = first + rays
+    return current
+
+
+@njit(nogil=True, cache=True)
+def _on_quad(light, u, v, axis):
+    # Bilinear: straight lines between points that divide opposite edges alike.
+    near = light[0, axis] + u * (light[1, axis] - light[0, axis])
+    far = light[3, axis] + u * (light[2, axis] - light[3, axis])
+    return near + v * (far - near)
+
+
+@njit(nogil=True, cache=True)
+def _cell_area(light, spans, i, j, size):
+    # Area of the lattice cell (i, j) of a quad light: twice, the cross product of its diagonals.
+    ax = ay = az = bx = by = bz = 0.0
+    for corner in range(4):
+        # Corners 0, 1, 2, 3 at (0, 0), (1, 0), (1, 1), (0, 1); diagonals 0-2 and 1-3.
+        u = (i + (size if corner == 1 or corner == 2 else 0)) / spans
+        v = (j + (size if corner >= 2 else 0)) / spans
+        sign = 1.0 if corner >= 2 else -1.0
+        x = _on_quad(light, u, v, 0)
+        y = _on_quad(light, u, v, 1)
+        z = _on_quad(light, u, v, 2)
+        if corner % 2 == 0:
+            ax, ay, az = ax + sign * x, ay + sign * y, az + sign * z
+        else:
+            bx, by, bz = bx + sign * x, by + sign * y, bz + sign * z
+    cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return math.sqrt(cx * cx + cy * cy + cz * cz)
+
+
+@njit(nogil=True, cache=True)
+def _adaptive_area_loop(
+    objects, cells, points, light, skip, mode, check, boxes, margin, reach, levels,
+    mailbox, touched, current, limit, occlusion, shots, counts,
+):  # fmt: skip
+    # The area counterpart of _adaptive_loop: cells of a lattice in place of stretches.
+    spans = 2 ** levels[1]
+    row_length = spans + 1
+    rays = row_length * row_length
+    planes = np.empty((4, 4))
+    no_planes = np.empty((0, 4))
+    origin, direction, far = np.empty((1, 3)), np.empty((1, 3)), 1.0
+    bands = occlusion.shape[1]
+    through = np.empty((rays, bands))
+    shot = np.empty(rays, dtype=np.bool_)
+    stack = np.empty((3 * levels[1] + 4, 3), dtype=np.int64)
+    places = np.empty(4, dtype=np.int64)
+    coarse = 2 ** (levels[1] - levels[0])
+    whole = _cell_area(light, spans, 0, 0, spans)
+    for row in range(points.shape[0]):
+        if current > limit - rays:
+            mailbox[:] = 0
+            touched[:] = 0
+            current = 1
+        first = current
+        last = first + rays - 1
+        used = _light_planes(points, row, light, reach, margin, planes) if check else 0
+        shot[:] = False
+        shots[row] = 0
+        occlusion[row] = 0.0
+        for begin in range(4 ** levels[0]):
+            stack[0, 0] = begin // 2 ** levels[0] * coarse
+            stack[0, 1] = begin % 2 ** levels[0] * coarse
+            stack[0, 2] = coarse
+            depth = 1
+            while depth > 0:
+                depth -= 1
+                i, j, size = stack[depth, 0], stack[depth, 1], stack[depth, 2]
+                for corner in range(4):
+                    p, q = i + size * (corner % 2), j + size * (corner // 2)
+                    place = p * row_length + q
+                    places[corner] = place
+                    if shot[place]:
+                        continue
+                    for k in range(3):
+                        origin[0, k] = points[row, k]
+                        direction[0, k] = _on_quad(light, p / spans, q / spans, k) - points[row, k]
+                    _shoot(
+                        objects, cells, origin, direction, far, skip[row : row + 1], mode,
+                        (mailbox, touched, first + shots[row]), first, last,
+                        planes[:used] if shots[row] != rays - 1 else no_planes, boxes, through[place], counts,
+                    )  # fmt: skip
+                    shot[place] = True
+                    shots[row] += 1
+                differ = False
+                for corner in range(1, 4):
+                    for band in range(bands):
+                        differ = differ or through[places[corner], band] != through[places[0], band]
+                if differ and size > 1:
+                    half = size // 2
+                    for corner in range(4):
+                        stack[depth, 0], stack[depth, 1] = i + half * (corner % 2), j + half * (corner // 2)
+                        stack[depth, 2] = half
+                        depth += 1
+                    continue
+                for band in range(bands):
+                    hidden = 0.0
+                    for corner in range(4):
+                        hidden += 0.25 * (1.0 - through[places[corner], band])
+                    occlusion[row, band] += hidden * _cell_area(light, spans, i, j, size) / whole
         # All K ids are spent, however many rays were shot: a culled polygon holds the last of them.
         current = first + rays
     return current
@@ -515,6 +619,75 @@ def adaptive_linear_occlusion(
         lambda rows, own, counts: _adaptive_loop(
             grid.objects, grid.cells, place[rows], run.lights_of(rows), run.skip[rows], run.mode, check, boxes,
             margin, run.reach, (least, most), own.mailbox, own.touched, own.current, own.limit,
+            occlusion[rows], shots[rows], counts,
+        ),
+    )  # fmt: skip
+    return LightOcclusion(occlusion, None, shots, counters)
+
+
+def adaptive_area_occlusion(
+    grid: VoxelGrid,
+    points: ArrayLike,
+    light: ArrayLike,
+    *,
+    levels: tuple[int, int] = (0, 3),
+    check: bool = True,
+    boxes: bool = False,
+    skip_polygons: ArrayLike | None = None,
+    ids: RayIDs | None = None,
+    workers: int = 1,
+    margin: float = MARGIN,
+) -> LightOcclusion:
+    """Occlusion of a four-cornered light with 4 to 81 rays a point: corners, then quadrants.
+
+    The area counterpart of :func:`adaptive_linear_occlusion`.  Rays go to the corners; a cell
+    whose four corners differ is cut in four by straight lines between the middles of its edges.
+    The counter then jumps to m + K, K = (2^most + 1)^2 the largest number of rays possible,
+    whatever was shot.  Each cell counts by its area and the mean of its corners: equal weights.
+
+    Four corners that agree settle their cell: what lies between them, all of the light with
+    ``least`` of 0, goes unseen.  ``levels=(n, n)`` shoots the whole lattice.
+
+    Parameters
+    ----------
+    grid, points, check, boxes, skip_polygons, ids, workers, margin
+        As in :func:`light_occlusion`.
+    light : (4, 3) float
+        Corners of a parallelogram or another convex quad, in order.
+    levels : (int, int)
+        Least and most halvings of an edge.
+
+    Raises
+    ------
+    InputError
+        If an argument is out of its range, the light is no convex quad or a point lies on it.
+    """
+    place = as_points(points)
+    lights = _lights(light, len(place))
+    if lights.shape[1] != 4:
+        raise InputError(f"light: found {lights.shape[1]} corners, expected the four of a convex quad")
+    least, most = levels
+    if not 0 <= least <= most <= 8:
+        raise InputError(f"levels: found {levels}, expected 0 <= least <= most <= 8")
+    spans = 2**most
+    lattice = np.array(
+        [
+            [[_on_quad(lights[0], i / spans, j / spans, k) for k in range(3)] for j in range(spans + 1)]
+            for i in range(spans + 1)
+        ]
+    ).reshape(1, -1, 3)
+    _check_on_light(lights, lattice)
+    for corner in lattice[0]:
+        if (place == corner).all(axis=1).any():
+            raise InputError("points: a point lies on a sample of the light; move it off the light")
+    run = _Run(grid, place, lights, skip_polygons, ids, workers)
+    occlusion = np.empty((len(place), run.bands))
+    shots = np.empty(len(place), dtype=np.int64)
+    counters = run(
+        (spans + 1) ** 2,
+        lambda rows, own, counts: _adaptive_area_loop(
+            grid.objects, grid.cells, place[rows], lights[0], run.skip[rows], run.mode, check, boxes, margin,
+            run.reach, (least, most), own.mailbox, own.touched, own.current, own.limit,
             occlusion[rows], shots[rows], counts,
         ),
     )  # fmt: skip
