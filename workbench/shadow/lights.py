@@ -129,7 +129,7 @@ def equal_weights(samples: LightSamples) -> FloatArray:
 
     They give the visible share of what the samples are spread over (length, area), which differs
     from the share of the irradiance by up to 0.022 of it below a straight edge; kept for
-    reproductions.  Source: Woo 1993, Figures 2 and 4; Heckbert and Herf's fraction of pixels is the
+    reproductions.  Source: Woo 1993, Figures 2 and 4; a hardware camera's fraction of pixels is the
     same thing.
     """
     return np.full(samples.weights.shape, 1.0 / samples.count)
