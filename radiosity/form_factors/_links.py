@@ -20,6 +20,23 @@ from radiosity.patches import PatchMesh
 from workbench.accel.box_tree import BoxTree, boxes_meeting_planes
 from workbench.culling.plane_vertex import CHECK_SLACK, light_pyramid, outside_planes
 from workbench.culling.shaft import MAX_SHAFT_PLANES, box_shaft
+from workbench.culling.tally import (
+    CHECK,
+    CLEAR,
+    CLOSED,
+    COMPLEX,
+    CULL,
+    CUT,
+    DARK,
+    EMPTY,
+    HORIZON,
+    LINK,
+    OVERFLOW,
+    PIECES,
+    SHAFT,
+    SHAFT_CULL,
+    SHAFT_TEST,
+)
 from workbench.geometry.flat import Geometry
 from workbench.geometry.lambert import lambert_piece
 from workbench.geometry.planes import newell_normal
@@ -33,44 +50,6 @@ CLUSTER_FAR = 2.0
 """Distance, in extents of a cluster, beyond which its samples stand for it."""
 MAX_CANDIDATES = 192
 """Longest candidate list handed down to a group; beyond it each point asks the tree itself."""
-
-# Rows of the tally that kernels fill; names of workbench.counters.
-TALLY = (
-    "box_tests",
-    "shafts",
-    "shafts_empty",
-    "shaft_tests",
-    "shaft_culls",
-    "horizon_culls",
-    "plane_vertex_checks",
-    "plane_vertex_culls",
-    "not_inshadow",
-    "inshadow",
-    "complex_shadow",
-    "closed_forms",
-    "exact_cuts",
-    "exact_pieces",
-    "exact_overflows",
-    "links",
-)
-(
-    _BOX,
-    _SHAFT,
-    _EMPTY,
-    _STEST,
-    _SCULL,
-    _HORIZON,
-    _CHECK,
-    _CULL,
-    _CLEAR,
-    _DARK,
-    _COMPLEX,
-    _CLOSED,
-    _CUT,
-    _PIECES,
-    _OVERFLOW,
-    _LINK,
-) = range(len(TALLY))
 
 NEEDS_RAYS = -1.0
 
@@ -268,9 +247,9 @@ def _pick(candidates, many, own, other, piece_polygon, corners, starts, planes, 
         piece = candidates[c]
         if piece_polygon[piece] == own or piece_polygon[piece] == other:
             continue
-        tally[_CHECK] += 1
+        tally[CHECK] += 1
         if outside_planes(corners, starts[piece], starts[piece + 1], planes, used, slack):
-            tally[_CULL] += 1
+            tally[CULL] += 1
             continue
         picked[kept] = piece
         kept += 1
@@ -295,13 +274,13 @@ def _point_share(
         share = open_share(x, y, z, nx, ny, nz, sender_corners, s0, s1, sender_normal, s, slack)
         if share <= 0.0:
             continue
-        tally[_CLOSED] += 1
+        tally[CLOSED] += 1
         used = light_pyramid(x, y, z, nx, ny, nz, sender_corners, s0, s1, sender_normal[s], 2.0 * slack, planes)
         kept = _pick(
             found, count, own, other, piece_polygon, corners, starts, planes, used, slack, limit, picked, tally
         )  # fmt: skip
         if kept == 0:
-            tally[_CLEAR] += 1
+            tally[CLEAR] += 1
             total += share
             continue
         pieces = -1
@@ -311,15 +290,15 @@ def _point_share(
                 x, y, z, nx, ny, nz, sender_corners, s0, s1, sender_normal[s], corners, starts, through, picked, kept,
                 boxes, sizes, weights, cut,
             )  # fmt: skip
-            tally[_CUT] += 1
+            tally[CUT] += 1
             if pieces < 0:
-                tally[_OVERFLOW] += 1
+                tally[OVERFLOW] += 1
         if pieces < 0:
-            tally[_COMPLEX] += 1
+            tally[COMPLEX] += 1
             return NEEDS_RAYS
-        tally[_PIECES] += pieces
+        tally[PIECES] += pieces
         if pieces == 0:
-            tally[_DARK] += 1
+            tally[DARK] += 1
         total += min(visible, share)
     return total
 
@@ -655,11 +634,11 @@ def _shaft_candidates(box, flat, normal, corner, own, group, patch, geo, mesh, f
             polygon = geo.piece_polygon[piece]
             if (flat and polygon == own) or (flat_sender and polygon == mesh.patch_polygon[patch]):
                 continue
-            tally[_STEST] += 1
+            tally[SHAFT_TEST] += 1
             if outside_planes(
                 geo.corners, geo.piece_start[piece], geo.piece_start[piece + 1], work.shaft, used, geo.slack
             ):
-                tally[_SCULL] += 1
+                tally[SHAFT_CULL] += 1
                 continue
             # A wall that has both ends in front of it (or both behind) comes between neither.
             if flat and flat_sender and _on_one_side(
@@ -668,7 +647,7 @@ def _shaft_candidates(box, flat, normal, corner, own, group, patch, geo, mesh, f
                 mesh.sender_start[mesh.patch_sender[group + 1]], mesh.sender_start[mesh.patch_sender[patch]],
                 mesh.sender_start[mesh.patch_sender[patch + 1]], geo.slack,
             ):  # fmt: skip
-                tally[_SCULL] += 1
+                tally[SHAFT_CULL] += 1
                 continue
             found[kept] = piece
             kept += 1
@@ -688,7 +667,7 @@ def _clear_factor(element, patch, gap, flat, flat_sender, geo, mesh, error, floo
     area, size = mesh.area[element], mesh.size[element]
     reach = (0.05 / error) ** 0.25 * size
     value = doubt = 0.0
-    tally[_CLOSED] += 1
+    tally[CLOSED] += 1
     closed = flat and flat_sender and (closed_forms or gap < 0.5 * reach)
     extent = 0.0 if flat_sender else patch_extent(mesh.patch_bounds, patch)
     far = not flat_sender and gap > CLUSTER_FAR * extent
@@ -845,7 +824,7 @@ def shoot(
         if (flat and not _group_faces(q, patch, mesh, geo.slack)) or (
             flat_sender and not _group_faces(patch, q, mesh, geo.slack)
         ):
-            tally[_HORIZON] += e1 - e0
+            tally[HORIZON] += e1 - e0
             continue
         # Shaft from the group to the patch; its candidates serve every element of the group.
         count = _shaft_candidates(
@@ -853,9 +832,9 @@ def shoot(
             mesh.sender_corners[mesh.sender_start[mesh.patch_sender[q]]], mesh.polygon[e0],
             q, patch, geo, mesh, work.found, work, tally,
         )  # fmt: skip
-        tally[_SHAFT] += 1
+        tally[SHAFT] += 1
         if count == 0:
-            tally[_EMPTY] += 1
+            tally[EMPTY] += 1
         if count > 0:
             # Both ends one convex polygon: one occluder may settle the whole group.
             u, v = mesh.patch_sender[q], mesh.patch_sender[patch]
@@ -868,7 +847,7 @@ def shoot(
                     geo.slack,
                 )
             ):  # fmt: skip
-                tally[_DARK] += e1 - e0
+                tally[DARK] += e1 - e0
                 continue
         for e in range(e0, e1):
             gap = box_distance(mesh.centroid, e, mesh.patch_bounds, patch)
@@ -877,9 +856,9 @@ def shoot(
                 e, patch, gap, flat, flat_sender, geo, mesh, error, floor, closed_forms, work, tally
             )
             if open_factor <= 0.0:
-                tally[_HORIZON] += 1
+                tally[HORIZON] += 1
                 continue
-            tally[_LINK] += 1
+            tally[LINK] += 1
             if count == 0:
                 factor[e] = open_factor
                 spread[e] = open_doubt
@@ -889,7 +868,7 @@ def shoot(
                 # Facets of a cluster are candidates of its own shaft: rays see best which of them block.
                 factor[e] = open_factor
                 rays[e] = True
-                tally[_COMPLEX] += 1
+                tally[COMPLEX] += 1
                 continue
             if count < 0 or count > 2 * limit:
                 # Long list: the shaft of this element alone may be empty, or short enough to cut.
@@ -900,17 +879,17 @@ def shoot(
                     work.box, True, mesh.normal[e], mesh.corners[mesh.piece_start[mesh.element_piece[e]]],
                     mesh.polygon[e], q, patch, geo, mesh, work.near, work, tally,
                 )  # fmt: skip
-                tally[_SHAFT] += 1
+                tally[SHAFT] += 1
                 candidates = work.near
                 if many == 0:
-                    tally[_EMPTY] += 1
+                    tally[EMPTY] += 1
                     factor[e] = open_factor
                     spread[e] = open_doubt
                     continue
                 if many < 0 or many > 4 * limit:
                     factor[e] = open_factor
                     rays[e] = True
-                    tally[_COMPLEX] += 1
+                    tally[COMPLEX] += 1
                     continue
             allowed = (error * open_factor + floor) * area
             depth = levels

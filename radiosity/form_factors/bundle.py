@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from radiosity.form_factors._links import (
     CLUSTER_FAR,
     SAMPLES,
-    TALLY,
     MeshArrays,
     Workspace,
     box_distance,
@@ -39,6 +38,7 @@ from radiosity.patches import PatchMesh
 from workbench.accel.box_tree import BoxTree
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
 from workbench.counters import Counters
+from workbench.culling.tally import add_tally, new_tally
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
 from workbench.geometry.planes import newell_normal
@@ -285,7 +285,7 @@ class ReceiverBundles:
 
         def settle(task: tuple[int, int, int]) -> tuple[NDArray, float, int]:
             row, first, last = task
-            tally = np.zeros(len(TALLY), dtype=np.int64)
+            tally = new_tally()
             work = self._idle.pop()
             try:
                 shoot(
@@ -304,7 +304,8 @@ class ReceiverBundles:
             return tally, seconds, traced
 
         for tally, seconds, traced in self._pool.map(settle, tasks):
-            self.counters.add(**dict(zip(TALLY, tally.tolist(), strict=True)), rays=traced)
+            add_tally(self.counters, tally)
+            self.counters.add(rays=traced)
             self.seconds_in_embree += seconds
         return Columns(chosen, factor, spread)
 

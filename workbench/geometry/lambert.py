@@ -14,7 +14,7 @@ import math
 
 from numba import njit
 
-__all__ = ["lambert_cone", "lambert_piece"]
+__all__ = ["lambert_piece"]
 
 _HALF_OVER_PI = 0.5 / math.pi
 
@@ -35,43 +35,12 @@ def _edge_term(ax, ay, az, bx, by, bz, nx, ny, nz):
 
 
 @njit(nogil=True, cache=True)
-def lambert_cone(rays, count, nx, ny, nz):
-    """Share filled by the convex polygon ``rays[:count]`` seen from the origin.
-
-    ``rays`` are corners relative to the point, clockwise about ``n`` as seen from above (that is,
-    counter-clockwise on the side of the polygon that faces the point).  The part below the
-    horizon ``n . r < 0`` is cut off.  The sign is negative for a polygon that turns its back.
-    """
-    total = 0.0
-    has_exit = has_entry = False
-    outx = outy = outz = inx = iny = inz = 0.0
-    px, py, pz = rays[count - 1, 0], rays[count - 1, 1], rays[count - 1, 2]
-    dp = nx * px + ny * py + nz * pz
-    for i in range(count):
-        cx, cy, cz = rays[i, 0], rays[i, 1], rays[i, 2]
-        dc = nx * cx + ny * cy + nz * cz
-        if dp >= 0.0:
-            if dc >= 0.0:
-                total += _edge_term(px, py, pz, cx, cy, cz, nx, ny, nz)
-            else:
-                t = dp / (dp - dc)
-                outx, outy, outz = px + t * (cx - px), py + t * (cy - py), pz + t * (cz - pz)
-                has_exit = True
-                total += _edge_term(px, py, pz, outx, outy, outz, nx, ny, nz)
-        elif dc >= 0.0:
-            t = dp / (dp - dc)
-            inx, iny, inz = px + t * (cx - px), py + t * (cy - py), pz + t * (cz - pz)
-            has_entry = True
-            total += _edge_term(inx, iny, inz, cx, cy, cz, nx, ny, nz)
-        px, py, pz, dp = cx, cy, cz, dc
-    if has_exit and has_entry:
-        total += _edge_term(outx, outy, outz, inx, iny, inz, nx, ny, nz)
-    return -total * _HALF_OVER_PI
-
-
-@njit(nogil=True, cache=True)
 def lambert_piece(x, y, z, nx, ny, nz, corners, start, stop):
-    """:func:`lambert_cone` for the polygon ``corners[start:stop]`` seen from the point (x, y, z)."""
+    """Share of the hemisphere at (x, y, z) about n that the convex ``corners[start:stop]`` fills.
+
+    Counter-clockwise corners, seen from the point, count positive: a polygon that turns its back
+    gives a negative share.  The part below the horizon is cut off.
+    """
     total = 0.0
     has_exit = has_entry = False
     outx = outy = outz = inx = iny = inz = 0.0

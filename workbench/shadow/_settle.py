@@ -12,6 +12,22 @@ from numba import njit
 from workbench.accel.box_tree import boxes_meeting_planes
 from workbench.culling.plane_vertex import light_pyramid, outside_planes
 from workbench.culling.shaft import MAX_SHAFT_PLANES, box_shaft
+from workbench.culling.tally import (
+    CHECK,
+    CLEAR,
+    CLOSED,
+    COMPLEX,
+    CULL,
+    CUT,
+    DARK,
+    EMPTY,
+    HORIZON,
+    OVERFLOW,
+    PIECES,
+    SHAFT,
+    SHAFT_CULL,
+    SHAFT_TEST,
+)
 from workbench.geometry.lambert import lambert_piece
 from workbench.shadow.area import MAX_CORNERS, MAX_PIECES, visible_share
 
@@ -20,43 +36,7 @@ MAX_CANDIDATES = 256
 SPLIT_DEPTH = 7
 """Most halvings of a sender whose exact cut has too many pieces."""
 
-# Rows of the tally, names of workbench.counters.
-TALLY = (
-    "box_tests",
-    "shafts",
-    "shafts_empty",
-    "shaft_tests",
-    "shaft_culls",
-    "horizon_culls",
-    "plane_vertex_checks",
-    "plane_vertex_culls",
-    "not_inshadow",
-    "inshadow",
-    "complex_shadow",
-    "closed_forms",
-    "exact_cuts",
-    "exact_pieces",
-    "exact_overflows",
-)
-(
-    _BOX,
-    _SHAFT,
-    _EMPTY,
-    _STEST,
-    _SCULL,
-    _HORIZON,
-    _CHECK,
-    _CULL,
-    _CLEAR,
-    _DARK,
-    _COMPLEX,
-    _CLOSED,
-    _CUT,
-    _PIECES,
-    _OVER,
-) = range(len(TALLY))
-
-CLEAR, DARK, COMPLEX, EXACT = 1, 2, 3, 4
+STATE_CLEAR, STATE_DARK, STATE_COMPLEX, STATE_EXACT = 1, 2, 3, 4
 
 
 @njit(nogil=True, cache=True)
@@ -84,7 +64,7 @@ def tile_candidates(
         # Irradiance is an integral: what only touches the shaft hides a null set.
         for k in range(used):
             planes[k, 3] += 2.0 * slack
-        tally[_SHAFT] += 1
+        tally[SHAFT] += 1
         many = boxes_meeting_planes(low, high, skip, head, leaf, order, bounds, planes, used, slack, found, tally)
         if many > MAX_CANDIDATES:
             counts[t] = -1
@@ -94,15 +74,15 @@ def tile_candidates(
             piece = found[i]
             if (flat and piece_polygon[piece] == own[t]) or piece_polygon[piece] == sender_own:
                 continue
-            tally[_STEST] += 1
+            tally[SHAFT_TEST] += 1
             if outside_planes(corners, starts[piece], starts[piece + 1], planes, used, slack):
-                tally[_SCULL] += 1
+                tally[SHAFT_CULL] += 1
                 continue
             lists[t, kept] = piece
             kept += 1
         counts[t] = kept
         if kept == 0:
-            tally[_EMPTY] += 1
+            tally[EMPTY] += 1
 
 
 @njit(nogil=True, cache=True)
@@ -133,14 +113,14 @@ def settle_points(
             value = 0.0
             if mx * x + my * y + mz * z - level > 1e-3 * slack:
                 value = lambert_piece(x, y, z, nx, ny, nz, sender, s0, s1)
-                tally[_CLOSED] += 1
+                tally[CLOSED] += 1
             if value <= 0.0:
-                tally[_HORIZON] += 1
-                open_share[i], share[i], state[i] = 0.0, 0.0, DARK
+                tally[HORIZON] += 1
+                open_share[i], share[i], state[i] = 0.0, 0.0, STATE_DARK
                 continue
-            open_share[i], share[i], state[i] = value, value, CLEAR
+            open_share[i], share[i], state[i] = value, value, STATE_CLEAR
             if counts[t] == 0:
-                tally[_CLEAR] += 1
+                tally[CLEAR] += 1
                 continue
             used = light_pyramid(x, y, z, nx, ny, nz, sender, s0, s1, sender_normal, 2.0 * slack, planes)
             many = counts[t]
@@ -156,16 +136,16 @@ def settle_points(
                     piece = found[c] if counts[t] < 0 else lists[t, c]
                     if piece_polygon[piece] == own[i] or piece_polygon[piece] == sender_own:
                         continue
-                    tally[_CHECK] += 1
+                    tally[CHECK] += 1
                     if outside_planes(corners, starts[piece], starts[piece + 1], planes, used, slack):
-                        tally[_CULL] += 1
+                        tally[CULL] += 1
                         continue
                     picked[kept] = piece
                     kept += 1
                     if kept > limit:
                         break
             if kept == 0:
-                tally[_CLEAR] += 1
+                tally[CLEAR] += 1
                 continue
             pieces = -1
             if kept <= limit:
@@ -173,18 +153,18 @@ def settle_points(
                     x, y, z, nx, ny, nz, sender, s0, s1, sender_normal, corners, starts, through, picked, kept,
                     boxes, sizes, weights, cut,
                 )  # fmt: skip
-                tally[_CUT] += 1
+                tally[CUT] += 1
                 if pieces < 0:
-                    tally[_OVER] += 1
+                    tally[OVERFLOW] += 1
             if pieces < 0:
-                tally[_COMPLEX] += 1
-                state[i] = COMPLEX
+                tally[COMPLEX] += 1
+                state[i] = STATE_COMPLEX
                 continue
-            tally[_PIECES] += pieces
-            share[i], state[i] = min(visible, value), EXACT
+            tally[PIECES] += pieces
+            share[i], state[i] = min(visible, value), STATE_EXACT
             if pieces == 0:
-                tally[_DARK] += 1
-                state[i] = DARK
+                tally[DARK] += 1
+                state[i] = STATE_DARK
 
 
 @njit(nogil=True, cache=True)
@@ -227,7 +207,7 @@ def exact_points(
                 here = depth[top]
                 top -= 1
                 whole = lambert_piece(x, y, z, nx, ny, nz, part, 0, 3)
-                tally[_CLOSED] += 1
+                tally[CLOSED] += 1
                 if whole <= 0.0:
                     continue
                 used = light_pyramid(x, y, z, nx, ny, nz, part, 0, 3, sender_normal, 2.0 * slack, planes)
@@ -240,9 +220,9 @@ def exact_points(
                         piece = found[c]
                         if piece_polygon[piece] == own[i] or piece_polygon[piece] == sender_own:
                             continue
-                        tally[_CHECK] += 1
+                        tally[CHECK] += 1
                         if outside_planes(corners, starts[piece], starts[piece + 1], planes, used, slack):
-                            tally[_CULL] += 1
+                            tally[CULL] += 1
                             continue
                         found[kept] = piece
                         kept += 1
@@ -255,12 +235,12 @@ def exact_points(
                         x, y, z, nx, ny, nz, part, 0, 3, sender_normal, corners, starts, through, found, kept,
                         boxes, sizes, weights, cut,
                     )  # fmt: skip
-                    tally[_CUT] += 1
+                    tally[CUT] += 1
                 if pieces >= 0:
-                    tally[_PIECES] += pieces
+                    tally[PIECES] += pieces
                     total += min(visible, whole)
                     continue
-                tally[_OVER] += 1
+                tally[OVERFLOW] += 1
                 if here >= SPLIT_DEPTH:
                     total += 0.5 * whole
                     unsure += 0.5 * whole

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
-from workbench.geometry.lambert import lambert_cone
+from workbench.geometry.lambert import lambert_piece
 from workbench.geometry.planes import clip_by_plane
 
 __all__ = ["MAX_CORNERS", "MAX_PIECES", "cut_workspace", "visible_share"]
@@ -200,5 +200,7 @@ def visible_share(
             return 0.0, 0
     share = 0.0
     for p in range(pieces):
-        share += weights[current, p] * max(lambert_cone(boxes[current, p], sizes[current, p], nx, ny, nz), 0.0)
+        share += weights[current, p] * max(
+            lambert_piece(0.0, 0.0, 0.0, nx, ny, nz, boxes[current, p], 0, sizes[current, p]), 0.0
+        )
     return share, pieces

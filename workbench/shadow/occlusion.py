@@ -23,6 +23,7 @@ from workbench.accel.embree import EmbreeAccelerator
 from workbench.arrays import as_points, as_unit_vectors
 from workbench.counters import Counters
 from workbench.culling.plane_vertex import CHECK_SLACK
+from workbench.culling.tally import TALLY, add_tally, new_tally
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.geometry.polygons import check_polygon, convex_pieces, plane_basis, vector_area
@@ -277,16 +278,16 @@ class Shader:
             part, share, state = self._settle(tiles, ring, normal, light.polygon_id, method, counters)
             seconds["settle"] = seconds.get("settle", 0.0) + time.perf_counter() - begin
             whole += part
-            waiting = np.flatnonzero(state == _settle.COMPLEX)
+            waiting = np.flatnonzero(state == _settle.STATE_COMPLEX)
             if len(waiting) and method == "exact":
                 begin = time.perf_counter()
                 self._cut(tiles, waiting, ring, normal, light.polygon_id, share, doubt, counters)
                 seconds["cut"] = seconds.get("cut", 0.0) + time.perf_counter() - begin
                 waiting = waiting[:0]
-            known = state != _settle.COMPLEX if method != "exact" else np.ones(n, dtype=bool)
+            known = state != _settle.STATE_COMPLEX if method != "exact" else np.ones(n, dtype=bool)
             seen[known] += share[known]
-            lit &= (state == _settle.CLEAR) | (part == 0.0)
-            dark &= (state == _settle.DARK) | (known & (share == 0.0))
+            lit &= (state == _settle.STATE_CLEAR) | (part == 0.0)
+            dark &= (state == _settle.STATE_DARK) | (known & (share == 0.0))
             if len(waiting):
                 complex_parts.append((ring, waiting))
         for ring, waiting in complex_parts:
@@ -319,7 +320,7 @@ class Shader:
 
         def work(first: int) -> NDArray[np.int64]:
             last = min(first + step, count)
-            tally = np.zeros(len(_settle.TALLY), dtype=np.int64)
+            tally = new_tally()
             if method != "rays":
                 _settle.tile_candidates(
                     tiles.bounds, tiles.normal, tiles.offset, tiles.polygon, first, last, ring, low, high, normal, own,
@@ -334,10 +335,10 @@ class Shader:
 
         with ThreadPoolExecutor(self.workers) as pool:
             for tally in pool.map(work, range(0, count, step)):
-                found = dict(zip(_settle.TALLY, tally.tolist(), strict=True))
+                found = dict(zip(TALLY, tally.tolist(), strict=True))
                 counters.add(**({"closed_forms": found["closed_forms"]} if method == "rays" else found))
         if method == "rays":
-            state[state == _settle.CLEAR] = _settle.COMPLEX
+            state[state == _settle.STATE_CLEAR] = _settle.STATE_COMPLEX
         return part, share, state
 
     def _cut(
@@ -348,7 +349,7 @@ class Shader:
         geo = self.geometry
 
         def work(block: IntArray) -> NDArray[np.int64]:
-            tally = np.zeros(len(_settle.TALLY), dtype=np.int64)
+            tally = new_tally()
             _settle.exact_points(
                 block, tiles.points, tiles.normals, tiles.own, ring, 0, len(ring), normal, own, geo.corners,
                 geo.piece_start, geo.piece_polygon, self._through, *self._tree, self._slack, share, doubt, tally,
@@ -357,7 +358,7 @@ class Shader:
 
         with ThreadPoolExecutor(self.workers) as pool:
             for tally in pool.map(work, np.array_split(waiting, max(1, len(waiting) // 256))):
-                counters.add(**dict(zip(_settle.TALLY, tally.tolist(), strict=True)))
+                add_tally(counters, tally)
 
     def _trace(
         self, tiles: _Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, method: str, error: float,
