@@ -251,6 +251,9 @@ def camera_study(
 ) -> StudyResult:
     """Measure the table: every method at every sampling, seconds and RMS error.
 
+    Sets ``LP_NUM_THREADS=0`` in the environment, unless it is set, so that a software OpenGL draws
+    on one thread like all else.
+
     Parameters
     ----------
     width, height : int
