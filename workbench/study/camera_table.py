@@ -432,7 +432,8 @@ def _draw(figure: Figure, rows: list[dict[str, Any]], uncertainty: float) -> Non
     scatter.set_ylabel("RMS error of the visible share of irradiance")
     scatter.set_title("Error against time; numbers: samples along the light's side")
     scatter.grid(which="both", alpha=0.25)
-    scatter.legend(fontsize=8)
+    scatter.set_ylim(top=5.0)  # room for the legend
+    scatter.legend(fontsize=8, ncols=2)
     compared = [row for row in rows if row["paper_ratio"] is not None and ", gl" not in row["method"]]
     compared = [row for row in compared if row["method"] != "voxel rays, check"]
     places = np.arange(len(compared))[::-1]
