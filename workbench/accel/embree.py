@@ -157,3 +157,13 @@ class EmbreeAccelerator:
         if len(self._polygon) == 0:
             return np.full(len(origins), -1, dtype=np.int32)
         return np.asarray(self._scene.run(origins, directions, dists=far, query="OCCLUDED"))
+
+    def nearest_raw(self, origins: NDArray, directions: NDArray) -> NDArray[np.int64]:
+        """First polygon (n,) along rays made in unit coordinates as float32, -1 for none.
+
+        For callers that intersect the polygon again in double precision; counts nothing.
+        """
+        if len(self._polygon) == 0:
+            return np.full(len(origins), NO_POLYGON, dtype=np.int64)
+        triangle = np.asarray(self._scene.run(origins, directions, query="INTERSECT"))
+        return np.where(triangle >= 0, self._polygon[triangle], NO_POLYGON)

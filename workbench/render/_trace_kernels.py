@@ -20,15 +20,25 @@ __all__ = [
     "LINEAR_LAMBERTIAN",
     "NOT_INSHADOW",
     "POINT",
+    "add_share",
+    "agree_of_corners",
+    "agreement",
+    "assume",
+    "begin",
     "child_keys",
+    "count_spared",
     "gather_light",
+    "interpolate",
     "light_rays",
     "light_targets",
     "lobe",
     "locate",
     "mirror",
+    "next_rays",
     "refract",
+    "sent_unlit",
     "uniform",
+    "unit_rays",
 ]
 
 NOT_INSHADOW, INSHADOW, COMPLEX_SHADOW = 0, 1, 2
@@ -70,10 +80,10 @@ def child_keys(keys, salt, copies):
 
 @njit(nogil=True, cache=True)
 def locate(
-    origins, directions, polygons, first_triangle, triangles, corner_normals, must_contain, near,
+    rows, origins, directions, polygons, first_triangle, triangles, corner_normals, must_contain, near,
     t, points, facing, shading, front,
 ):  # fmt: skip
-    """Where each ray meets the polygon it is said to meet, and the normals there.
+    """Where each ray of ``rows`` meets the polygon it is said to meet, and the normals there.
 
     Every polygon is a fan of ``triangles[first_triangle[p]:first_triangle[p + 1]]``; the one that
     contains the crossing best decides.  With ``must_contain`` a ray that crosses outside the
@@ -83,7 +93,7 @@ def locate(
     the front side is seen.
     """
     smooth = corner_normals.shape[0] > 0
-    for i in range(polygons.shape[0]):
+    for i in rows:
         p = polygons[i]
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         best = -math.inf
@@ -178,21 +188,28 @@ def light_targets(law, corners, cumulative, normals, keys, salt, count, jitter, 
 
 
 @njit(nogil=True, cache=True)
+def assume(agreed, pixel, node, corner_state, light, assumed):
+    """State of each point for one light, where its pixel's corners agree; COMPLEX_SHADOW elsewhere."""
+    for i in range(agreed.shape[0]):
+        assumed[i] = corner_state[pixel[i], node[i], light] if agreed[i] else COMPLEX_SHADOW
+
+
+@njit(nogil=True, cache=True)
 def light_rays(
-    law, targets, axes, scale, cosine_cut, spot_exponent, falls, highlight, offset, centre, unit,
-    points, facing, shading, mirrored, exponent, lit, assumed,
-    direct, shine, samples_seen, out_of_cone, ray_origin, ray_along, ray_weight, ray_shine, ray_owner,
+    law, targets, axes, scale, cosine_cut, spot_exponent, falls, highlight, power, offset, centre, unit,
+    points, facing, shading, mirrored, exponent, lit, assumed, reflectance, specular, surface,
+    leaving, samples_seen, out_of_cone, ray_origin, ray_along, ray_weight, ray_shine, ray_owner,
 ):  # fmt: skip
     """Shadow rays from points to one light, and the light that is assumed to arrive without any.
 
     ``targets`` and ``axes`` (1 or n, K, 3): the light's samples.  ``assumed`` (n,): a state a
-    point; NOT_INSHADOW adds to ``direct`` and ``shine`` without a ray, INSHADOW adds nothing,
-    COMPLEX_SHADOW makes a ray.  ``direct`` is the irradiance and ``shine`` the light in the
-    highlight's lobe, both per unit of the light's power.  ``samples_seen`` counts the samples above
-    the horizon; ``out_of_cone`` marks points that a spot does not reach.  Rays are made in Embree's
-    unit coordinates (``centre``, ``unit``).  Returns how many.
+    point; NOT_INSHADOW adds to ``leaving`` (n, bands) without a ray, INSHADOW adds nothing,
+    COMPLEX_SHADOW makes a ray.  ``samples_seen`` counts the samples above the horizon;
+    ``out_of_cone`` marks points that a spot does not reach.  Rays are made in Embree's unit
+    coordinates (``centre``, ``unit``).  Returns how many.
     """
     rays = 0
+    bands = power.shape[0]
     for i in range(points.shape[0]):
         samples_seen[i] = 0
         out_of_cone[i] = False
@@ -201,6 +218,7 @@ def light_rays(
         nx, ny, nz = shading[i, 0], shading[i, 1], shading[i, 2]
         gx, gy, gz = facing[i, 0], facing[i, 1], facing[i, 2]
         row = i if targets.shape[0] > 1 else 0
+        direct = shine = 0.0
         for k in range(targets.shape[1]):
             ax, ay, az = axes[row, k, 0], axes[row, k, 1], axes[row, k, 2]
             if law == DIRECTIONAL:
@@ -240,14 +258,14 @@ def light_rays(
             if assumed[i] == INSHADOW:
                 continue
             lobe_weight = 0.0
-            if highlight and exponent[i] >= 0.0:
+            if highlight and exponent[surface[i]] >= 0.0:
                 toward = mirrored[i, 0] * lx + mirrored[i, 1] * ly + mirrored[i, 2] * lz
                 if toward > 0.0:
-                    e = exponent[i]
+                    e = exponent[surface[i]]
                     lobe_weight = weight * (e + 1.0) / (2.0 * math.pi) * toward**e
             if assumed[i] == NOT_INSHADOW:
-                direct[i, :] += weight * cosine
-                shine[i, :] += lobe_weight
+                direct += weight * cosine
+                shine += lobe_weight
                 continue
             sx, sy, sz = points[i, 0] + offset * gx, points[i, 1] + offset * gy, points[i, 2] + offset * gz
             if law == DIRECTIONAL:
@@ -265,40 +283,47 @@ def light_rays(
             ray_shine[rays] = lobe_weight
             ray_owner[rays] = i
             rays += 1
+        if assumed[i] == NOT_INSHADOW:
+            for b in range(bands):
+                diffuse = reflectance[i, b] / math.pi * direct
+                leaving[i, b] += (diffuse + specular[surface[i], b] * shine) * power[b]
     return rays
 
 
 @njit(nogil=True, cache=True)
 def gather_light(
-    rays, through, ray_weight, ray_shine, ray_owner, lit, assumed, samples_seen, out_of_cone, direct, shine, state
-):
-    """Add what shadow rays let through (rays, b), and say in which state each point is found."""
-    bands = direct.shape[1]
+    rays, through, ray_weight, ray_shine, ray_owner, power, reflectance, specular, surface, assumed, out_of_cone,
+    leaving, state,
+):  # fmt: skip
+    """Add what shadow rays let through (rays, 1 or bands), and say in which state each point is found."""
+    bands, colours = power.shape[0], through.shape[1]
+    direct, shine = np.empty(colours), np.empty(colours)
     for i in range(state.shape[0]):
-        if assumed[i] != COMPLEX_SHADOW:
-            state[i] = assumed[i]
-        elif lit[i] and out_of_cone[i]:
-            state[i] = COMPLEX_SHADOW  # nobody looked
-        else:
+        state[i] = assumed[i]
+        if assumed[i] == COMPLEX_SHADOW and not out_of_cone[i]:
             state[i] = INSHADOW  # below the horizon, until a ray says otherwise
     r = 0
     while r < rays:
         owner = ray_owner[r]
         open_rays = shut_rays = 0
         first = r
+        direct[:] = 0.0
+        shine[:] = 0.0
         while r < rays and ray_owner[r] == owner:
             clear = shut = True
-            for b in range(bands):
-                passed = through[r, b]
+            for c in range(colours):
+                passed = through[r, c]
                 clear = clear and passed == 1.0
                 shut = shut and passed == 0.0
-                direct[owner, b] += ray_weight[r] * passed
-                shine[owner, b] += ray_shine[r] * passed
+                direct[c] += ray_weight[r] * passed
+                shine[c] += ray_shine[r] * passed
             open_rays += clear
             shut_rays += shut
             r += 1
-        if out_of_cone[owner]:
-            continue
+        for b in range(bands):
+            c = b if colours > 1 else 0
+            diffuse = reflectance[owner, b] / math.pi * direct[c]
+            leaving[owner, b] += (diffuse + specular[surface[owner], b] * shine[c]) * power[b]
         if open_rays == r - first:
             state[owner] = NOT_INSHADOW
         elif shut_rays == r - first:
@@ -308,10 +333,155 @@ def gather_light(
 
 
 @njit(nogil=True, cache=True)
-def mirror(directions, shading, facing):
-    """Mirrored directions (n, 3), about the geometric normal where the other would lead inside."""
+def count_spared(assumed, lit, seen, sample, saved):
+    """Add to each sample the shadow rays that assumed states spared; returns the points and rays."""
+    points = rays = 0
+    for i in range(assumed.shape[0]):
+        if lit[i] and assumed[i] != COMPLEX_SHADOW and seen[i] > 0:
+            points += 1
+            rays += seen[i]
+            saved[sample[i]] += seen[i]
+    return points, rays
+
+
+@njit(nogil=True, cache=True)
+def unit_rays(origins, directions, centre, unit):
+    """Rays (n, 3) as float32 in Embree's unit coordinates; directions keep their length."""
+    start = np.empty(origins.shape, dtype=np.float32)
+    along = np.empty(origins.shape, dtype=np.float32)
+    for i in range(origins.shape[0]):
+        for c in range(3):
+            start[i, c] = (origins[i, c] - centre[c]) * unit
+            along[i, c] = directions[i, c]
+    return start, along
+
+
+@njit(nogil=True, cache=True)
+def begin(surface, front, both_sides, reflectances, lit, reflectance):
+    """For each hit, whether its side is lit, and its reflectance."""
+    for i in range(surface.shape[0]):
+        s = surface[i]
+        lit[i] = front[i] or both_sides[s]
+        for b in range(reflectances.shape[1]):
+            reflectance[i, b] = reflectances[s, b]
+
+
+@njit(nogil=True, cache=True)
+def sent_unlit(surface, lit, reflectance, radiances, ambient, leaving):
+    """What each hit sends of itself and of the ambient light; nothing from a side that is not lit."""
+    for i in range(surface.shape[0]):
+        for b in range(radiances.shape[1]):
+            leaving[i, b] = radiances[surface[i], b] + reflectance[i, b] * ambient[b] if lit[i] else 0.0
+
+
+@njit(nogil=True, cache=True)
+def agreement(pixel, node, surface, shading, corner_surface, corner_normals, cosine, agreed):
+    """Whether each hit lies on the surface that its pixel's corners share, with a normal like theirs."""
+    for i in range(surface.shape[0]):
+        agreed[i] = node[i] >= 0 and corner_surface[pixel[i], max(node[i], 0)] == surface[i]
+        if agreed[i] and corner_normals.shape[0] > 0:
+            for c in range(4):
+                n = corner_normals[pixel[i], node[i], c]
+                if n[0] * shading[i, 0] + n[1] * shading[i, 1] + n[2] * shading[i, 2] < cosine:
+                    agreed[i] = False
+
+
+@njit(nogil=True, cache=True)
+def interpolate(
+    rows, agreed, sample, pixel, node, surface, share, spread, values, corners, x, y, similar, leaving, left
+):
+    """Add radiance interpolated between corners to some hits; returns how many rows are ``left`` for rays.
+
+    ``values`` (trees, nodes, bands) and ``corners`` (pixels, 4), rows of the trees; ``spread``
+    (pixels, nodes) the corners' largest difference, NaN where one has no value.
+    """
+    count = 0
+    bands = leaving.shape[1]
+    for place in range(rows.shape[0]):
+        i = rows[place]
+        use = agreed[i]
+        if use:
+            most = 0.0
+            for b in range(bands):
+                most = max(most, share[surface[i], b])
+            use = spread[pixel[i], node[i]] * most <= similar
+        if not use:
+            left[count] = i
+            count += 1
+            continue
+        four = corners[pixel[i]]
+        u, v = x[sample[i]], y[sample[i]]
+        for b in range(bands):
+            top = values[four[0], node[i], b] * (1.0 - u) + values[four[1], node[i], b] * u
+            bottom = values[four[2], node[i], b] * (1.0 - u) + values[four[3], node[i], b] * u
+            leaving[i, b] += share[surface[i], b] * (top * (1.0 - v) + bottom * v)
+    return count
+
+
+@njit(nogil=True, cache=True)
+def agree_of_corners(surface, state, values_a, values_b, polygon, corners, out_surface, out_state, out_polygon, spread):
+    """What four corners (pixels, 4) of each pixel share; see :class:`workbench.render.atomic.Guide`.
+
+    ``spread`` (2, pixels, nodes): largest differences of ``values_a`` and of ``values_b``.
+    """
+    for p in range(corners.shape[0]):
+        a, b, c, d = corners[p, 0], corners[p, 1], corners[p, 2], corners[p, 3]
+        same = polygon[a] == polygon[b] == polygon[c] == polygon[d]
+        out_polygon[p] = polygon[a] if same else -1
+        for node in range(surface.shape[1]):
+            met = surface[a, node]
+            same = met == surface[b, node] == surface[c, node] == surface[d, node]
+            out_surface[p, node] = met if same else -3
+            for light in range(state.shape[2]):
+                found = state[a, node, light]
+                same = found == state[b, node, light] == state[c, node, light] == state[d, node, light]
+                out_state[p, node, light] = found if same else COMPLEX_SHADOW
+            if out_surface[p, node] < 0:
+                spread[0, p, node] = spread[1, p, node] = np.nan
+                continue
+            spread[0, p, node] = _spread(values_a, a, b, c, d, node)
+            spread[1, p, node] = _spread(values_b, a, b, c, d, node)
+
+
+@njit(nogil=True, cache=True)
+def _spread(values, a, b, c, d, node):
+    most = 0.0
+    for band in range(values.shape[2]):
+        va, vb, vc, vd = values[a, node, band], values[b, node, band], values[c, node, band], values[d, node, band]
+        if not (va == va and vb == vb and vc == vc and vd == vd):
+            return np.nan
+        most = max(most, max(va, vb, vc, vd) - min(va, vb, vc, vd))
+    return most
+
+
+@njit(nogil=True, cache=True)
+def add_share(rows, surface, share, values, leaving):
+    """Add to hits ``rows`` their surfaces' share of ``values`` (rows, bands)."""
+    for place in range(rows.shape[0]):
+        i = rows[place]
+        for b in range(leaving.shape[1]):
+            leaving[i, b] += share[surface[i], b] * values[place, b]
+
+
+@njit(nogil=True, cache=True)
+def next_rays(rows, points, facing, side, offset, start):
+    """Origins off the surface, toward the viewer or (``side`` < 0) away from him."""
+    for place in range(rows.shape[0]):
+        i = rows[place]
+        for c in range(3):
+            start[place, c] = points[i, c] + side[place] * offset * facing[i, c]
+
+
+@njit(nogil=True, cache=True)
+def mirror(directions, shading, facing, surface, mirrors):
+    """Mirrored directions (n, 3), about the geometric normal where the other would lead inside.
+
+    Only for hits on surfaces with ``mirrors`` set; the others' rows mean nothing.
+    """
     found = np.empty_like(directions)
     for i in range(directions.shape[0]):
+        if not mirrors[surface[i]]:
+            continue
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         nx, ny, nz = shading[i, 0], shading[i, 1], shading[i, 2]
         gx, gy, gz = facing[i, 0], facing[i, 1], facing[i, 2]

@@ -13,8 +13,10 @@ rows, and any other height gives the same picture bit for bit (unless ``shared_b
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -219,6 +221,35 @@ def _middles(pixel, place, half, columns, known, user, count):
     return wanted[:found], owner[:found]
 
 
+@njit(nogil=True, cache=True)
+def _lattice_rays(samples, columns, top, step, corner, right, down):
+    # Unit directions through samples of a band that begins at pixel row ``top``, and their numbers
+    # in the whole picture's lattice.
+    along = np.empty((samples.shape[0], 3))
+    number = np.empty(samples.shape[0], dtype=np.int64)
+    for i in range(samples.shape[0]):
+        line = samples[i] // columns + top * step
+        column = samples[i] % columns
+        number[i] = line * columns + column
+        x, y = column / step, line / step
+        dx = corner[0] + x * right[0] + y * down[0]
+        dy = corner[1] + x * right[1] + y * down[1]
+        dz = corner[2] + x * right[2] + y * down[2]
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        along[i, 0], along[i, 1], along[i, 2] = dx / length, dy / length, dz / length
+    return along, number
+
+
+@njit(nogil=True, cache=True)
+def _places(samples, owner, columns, step, pixel_line, pixel_column):
+    # Where in its pixel each sample lies, 0..1 to the right and downward.
+    x, y = np.empty(samples.shape[0]), np.empty(samples.shape[0])
+    for i in range(samples.shape[0]):
+        x[i] = (samples[i] % columns) / step - pixel_column[owner[i]]
+        y[i] = (samples[i] // columns) / step - pixel_line[owner[i]]
+    return x, y
+
+
 class _Bands:
     """The state that goes from one band of rows to the next.
 
@@ -250,16 +281,11 @@ class _Bands:
         self.line_known = np.zeros(self.columns, dtype=bool)
         self.line_trees: RayTrees | None = None
 
-    def _shoot(self, samples: IntArray, top: int, **how) -> FloatArray:
+    def _shoot(self, samples: IntArray, top: int, *how: Any) -> FloatArray:
         """Trace samples of the band's lattice, numbered along its rows."""
-        line, column = np.divmod(samples, self.columns)
-        line = line + top * self.step
-        found = self.tracer.trace(
-            self.rays.eye,
-            self.rays.directions(column / self.step, line / self.step),
-            keys=line * self.columns + column,
-            **how,
-        )
+        rays = self.rays
+        along, number = _lattice_rays(samples, self.columns, top, self.step, rays.corner, rays.right, rays.down)
+        found = self.tracer.trace_unchecked(rays.eye[None], along, number, *how)
         self.tally.add(found.tally)
         self.traced += len(samples)
         self._spared = found.saved
@@ -285,9 +311,7 @@ class _Bands:
             new = slice(width + 1, None)
             if trees is not None and self.line_trees is not None:
                 trees.put(slice(0, width + 1), self.line_trees)
-        self.colour[corners[new]] = self._shoot(
-            corners[new], top, record=trees.rows(new) if trees is not None else None
-        )
+        self.colour[corners[new]] = self._shoot(corners[new], top, trees.rows(new) if trees is not None else None)
         self.known[corners[new]] = True
 
         pixel_line, pixel_column = np.meshgrid(np.arange(bottom - top), np.arange(width), indexing="ij")
@@ -376,7 +400,5 @@ class _Bands:
     def _inside(self, wanted: IntArray, owner: IntArray, guide: Guide | None, guide_row: IntArray) -> FloatArray:
         if guide is None:
             return self._shoot(wanted, self.top)
-        line, column = np.divmod(wanted, self.columns)
-        x = column / self.step - self.pixel_column[owner]
-        y = line / self.step - self.pixel_line[owner]
-        return self._shoot(wanted, self.top, guide=guide, guide_rows=guide_row[owner], place=(x, y))
+        place = _places(wanted, owner, self.columns, self.step, self.pixel_line, self.pixel_column)
+        return self._shoot(wanted, self.top, None, guide, guide_row[owner], place)

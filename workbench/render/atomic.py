@@ -23,13 +23,13 @@ shadow of side ``w`` pixels, placed at random, hides between four corners with c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.errors import OptionError
-from workbench.render._trace_kernels import COMPLEX_SHADOW
+from workbench.render import _trace_kernels as kernels
 
 __all__ = ["COMPONENTS", "AtomicOptions", "Guide", "RayTrees"]
 
@@ -124,7 +124,7 @@ class RayTrees:
         return cls(
             polygon=np.full(count, NO_SURFACE, dtype=np.int32),
             surface=np.full((count, nodes), NOT_TRACED, dtype=np.int32),
-            state=np.full((count, nodes, lights), COMPLEX_SHADOW, dtype=np.uint8),
+            state=np.full((count, nodes, lights), kernels.COMPLEX_SHADOW, dtype=np.uint8),
             reflected=np.full((count, nodes, bands), np.nan, dtype=np.float32),
             refracted=np.full((count, nodes, bands), np.nan, dtype=np.float32),
             normal=np.zeros((count, nodes, 3), dtype=np.float32) if normals else None,
@@ -159,85 +159,65 @@ class Guide:
     Parameters
     ----------
     options : AtomicOptions
+    trees : RayTrees
+        The corners' records.
+    corners : (p, 4) int
+        Rows of ``trees``: upper left, upper right, lower left, lower right.
     polygon : (p,) int32
         Polygon that all four met, or -1.
     surface : (p, nodes) int32
         Surface that all four met, NO_SURFACE included, or DISAGREE.
     state : (p, nodes, lights) uint8
         State that all four found, or COMPLEX_SHADOW.
-    reflected, refracted : (p, nodes, 4, bands) float32
-        The corners' radiances: upper left, upper right, lower left, lower right.
     reflection_spread, refraction_spread : (p, nodes) float32
-        Largest difference between corners over the bands; NaN where one is missing.
-    normal : (p, nodes, 4, 3) float32 or None
+        Largest difference between the corners' radiances; NaN where one is missing.
+    normal : (p, nodes, 4, 3) float32
+        The corners' normals; empty without the criterion of normals.
     """
 
     options: AtomicOptions
+    trees: RayTrees
+    corners: IntArray
     polygon: NDArray[np.int32]
     surface: NDArray[np.int32]
     state: NDArray[np.uint8]
-    reflected: NDArray[np.float32]
-    refracted: NDArray[np.float32]
     reflection_spread: NDArray[np.float32]
     refraction_spread: NDArray[np.float32]
-    normal: NDArray[np.float32] | None
+    normal: NDArray[np.float32]
+
+    @property
+    def cosine(self) -> float:
+        """Least cosine between normals that agree; a little less for those of float32."""
+        angle = self.options.normal_angle_deg
+        return -2.0 if angle is None else float(np.cos(np.radians(angle))) - 1e-6
 
     @classmethod
     def from_corners(cls, trees: RayTrees, corners: IntArray, options: AtomicOptions) -> Guide:
         """Agreement of pixels whose corners are the rows ``corners`` (p, 4) of ``trees``."""
-        use = set(options.components)
-        polygon = trees.polygon[corners]
-        met = trees.surface[corners]
-        surface = np.where((met == met[:, :1]).all(axis=1), met[:, 0], DISAGREE).astype(np.int32)
-        normal = None
+        pixels, (_, nodes, lights) = len(corners), trees.state.shape
+        surface = np.empty((pixels, nodes), dtype=np.int32)
+        state = np.empty((pixels, nodes, lights), dtype=np.uint8)
+        polygon = np.empty(pixels, dtype=np.int32)
+        spread = np.empty((2, pixels, nodes), dtype=np.float32)
+        kernels.agree_of_corners(
+            trees.surface, trees.state, trees.reflected, trees.refracted, trees.polygon, corners,
+            surface, state, polygon, spread,
+        )  # fmt: skip
+        normal = np.empty((0, nodes, 4, 3), dtype=np.float32)
+        guide = cls(options, trees, corners, polygon, surface, state, spread[0], spread[1], normal)
         if trees.normal is not None and options.normal_angle_deg is not None:
-            normal = trees.normal[corners].transpose(0, 2, 1, 3)
+            normal = np.ascontiguousarray(trees.normal[corners].transpose(0, 2, 1, 3))
             alike = np.einsum("pnci,pndi->pncd", normal, normal).min(axis=(2, 3))
-            surface = np.where((alike < _cosine(options)) & (surface >= 0), DISAGREE, surface).astype(np.int32)
-        found = trees.state[corners]
-        state = np.where((found == found[:, :1]).all(axis=1), found[:, 0], COMPLEX_SHADOW).astype(np.uint8)
+            surface[(alike < guide.cosine) & (surface >= 0)] = DISAGREE
+            guide = replace(guide, normal=normal)
+        polygon[surface[:, 0] == DISAGREE] = NO_SURFACE
+        use = options.components
         if "shadows" not in use:
-            state[:] = COMPLEX_SHADOW
-        same = (polygon == polygon[:, :1]).all(axis=1) & ("cast" in use) & (surface[:, 0] != DISAGREE)
-        reflected, reflection_spread = _corner_values(trees.reflected, corners, "reflection" in use)
-        refracted, refraction_spread = _corner_values(trees.refracted, corners, "refraction" in use)
-        return cls(
-            options,
-            np.where(same, polygon[:, 0], NO_SURFACE).astype(np.int32),
-            surface,
-            state,
-            reflected,
-            refracted,
-            reflection_spread,
-            refraction_spread,
-            normal,
-        )
-
-    def agrees(self, row: IntArray, node: NDArray, surface: NDArray, shading: FloatArray) -> NDArray[np.bool_]:
-        """Whether rays that met ``surface`` (n,) at ``node`` met what their pixels' corners met."""
-        found = self.surface[row, node] == surface
-        if self.normal is not None:
-            corners = self.normal[row, node]
-            alike = np.einsum("nci,ni->nc", corners, shading).min(axis=1)
-            found &= alike >= _cosine(self.options)
-        return found
-
-
-def _cosine(options: AtomicOptions) -> float:
-    # float32 normals: equal ones have a cosine a little below 1.
-    return float(np.cos(np.radians(options.normal_angle_deg))) - 1e-6 if options.normal_angle_deg else -1.0
-
-
-def _corner_values(values: NDArray, corners: IntArray, use: bool) -> tuple[NDArray, NDArray]:
-    if not use:
-        return np.empty((0, 0, 4, 0), np.float32), np.full((len(corners), values.shape[1]), np.nan, np.float32)
-    four = values[corners]
-    spread = (four.max(axis=1) - four.min(axis=1)).max(axis=-1)
-    return np.ascontiguousarray(four.transpose(0, 2, 1, 3)), spread
-
-
-def bilinear(corners: NDArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Values (n, bands) inside pixels from those at the corners (n, 4, bands); ``x``, ``y`` (n,) in 0..1."""
-    top = corners[:, 0] + x[:, None] * (corners[:, 1] - corners[:, 0])
-    bottom = corners[:, 2] + x[:, None] * (corners[:, 3] - corners[:, 2])
-    return top + y[:, None] * (bottom - top)
+            state[:] = kernels.COMPLEX_SHADOW
+        if "cast" not in use:
+            polygon[:] = NO_SURFACE
+        if "reflection" not in use:
+            guide.reflection_spread[:] = np.nan
+        if "refraction" not in use:
+            guide.refraction_spread[:] = np.nan
+        return guide

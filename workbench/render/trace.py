@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,7 +33,7 @@ from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.render import _trace_kernels as kernels
 from workbench.render._trace_kernels import COMPLEX_SHADOW
-from workbench.render.atomic import NO_SURFACE, Guide, RayTrees, bilinear
+from workbench.render.atomic import NO_SURFACE, Guide, RayTrees
 from workbench.render.textures import Texture
 from workbench.scene.model import Light, Scene, Surface
 
@@ -439,21 +439,34 @@ class Tracer:
         start = as_points(origins, "origins")
         if len(start) not in (1, count):
             raise InputError(f"origins and directions: found {len(start)} and {count} rows, expected as many")
-        start = np.ascontiguousarray(np.broadcast_to(start, along.shape))
+        if guide is not None and (guide_rows is None or place is None):
+            raise InputError("guide: found no guide_rows or place, expected both")
         number = np.arange(count) if keys is None else np.asarray(keys)
+        return self.trace_unchecked(start, along, number, record, guide, guide_rows, place)
+
+    def trace_unchecked(
+        self,
+        start: FloatArray,
+        along: FloatArray,
+        number: IntArray,
+        record: RayTrees | None = None,
+        guide: Guide | None = None,
+        guide_rows: IntArray | None = None,
+        place: tuple[FloatArray, FloatArray] | None = None,
+    ) -> Traced:
+        """:meth:`trace` for callers that made the rays themselves: nothing is checked."""
+        count = len(along)
         salted = kernels.child_keys(number.astype(np.uint64), self.options.seed, 1)
         guided = None
-        if guide is not None:
-            if guide_rows is None or place is None:
-                raise InputError("guide: found no guide_rows or place, expected both")
-            guided = _Guided(guide, np.asarray(guide_rows), *place)
+        if guide is not None and guide_rows is not None and place is not None:
+            guided = _Guided(guide, guide_rows, *place)
         radiance = np.empty((count, self.bands))
         surface = np.empty(count, dtype=np.int64)
         saved = np.zeros(count, dtype=np.int64)
 
         def work(rows: slice) -> RayTally:
             wave = _Wave(
-                start[rows],
+                np.ascontiguousarray(np.broadcast_to(start if len(start) == 1 else start[rows], along[rows].shape)),
                 along[rows],
                 salted[rows],
                 np.arange(rows.stop - rows.start),
@@ -541,7 +554,10 @@ class _Wave:
 
 @dataclass(frozen=True)
 class _Found:
-    """The hits of a wave, a row a ray that met something; ``ray`` is its row in the wave."""
+    """The hits of a wave, a row a ray that met something; ``ray`` is its row in the wave.
+
+    With a guide, ``pixel`` is the guide's row and ``agreed`` whether the corners met that surface.
+    """
 
     ray: IntArray
     surface: NDArray[np.int32]
@@ -550,7 +566,10 @@ class _Found:
     shading: FloatArray
     front: NDArray[np.bool_]
     directions: FloatArray
-    agreed: NDArray[np.bool_] | None
+    sample: IntArray
+    node: IntArray
+    pixel: IntArray
+    agreed: NDArray[np.bool_]
 
 
 class _Sweep:
@@ -574,29 +593,30 @@ class _Sweep:
 
     def follow(self, wave: _Wave, depth: int) -> FloatArray:
         """Radiance (n, bands) along the rays of a wave."""
-        tracer = self.tracer
-        radiance = np.broadcast_to(tracer.scene.background, (len(wave.sample), tracer.bands)).copy()
+        tracer, materials = self.tracer, self.tracer._materials
+        radiance = np.empty((len(wave.sample), tracer.bands))
         found = self._hits(wave, depth)
         if self.record is not None:
             self._note_surfaces(wave, found)
-        if len(found.ray) == 0:
+        count = len(found.ray)
+        if count < len(radiance):
+            radiance[:] = tracer.scene.background
+        if count == 0:
             return radiance
-        materials = tracer._materials
-        surface = found.surface
-        lit = found.front | materials.both_sides[surface]
-        reflectance = materials.reflectance[surface]
+        lit, reflectance = np.empty(count, dtype=bool), np.empty((count, tracer.bands))
+        kernels.begin(found.surface, found.front, materials.both_sides, materials.reflectance, lit, reflectance)
         for index, texture in tracer._textures.items():
-            rows = np.flatnonzero(surface == index)
+            rows = np.flatnonzero(found.surface == index)
             if len(rows):
                 reflectance[rows] *= texture(found.points[rows])
-        mirrored = kernels.mirror(found.directions, found.shading, found.facing)
-        leaving = reflectance * tracer._ambient
-        leaving += materials.radiance[surface]
+        mirrored = kernels.mirror(found.directions, found.shading, found.facing, found.surface, materials.mirrors)
+        leaving = radiance if count == len(radiance) else np.empty((count, tracer.bands))
+        kernels.sent_unlit(found.surface, lit, reflectance, materials.radiance, tracer._ambient, leaving)
         self._light(wave, found, lit, reflectance, mirrored, leaving)
-        leaving[~lit] = 0.0
         if depth < tracer.options.depth:
             self._go_on(wave, found, lit, mirrored, leaving, depth)
-        radiance[found.ray] = leaving
+        if leaving is not radiance:
+            radiance[found.ray] = leaving
         return radiance
 
     # ---- hits
@@ -609,32 +629,30 @@ class _Sweep:
         front = np.zeros(count, dtype=bool)
         polygon = np.full(count, NO_POLYGON, dtype=np.int64)
 
-        def locate(rows: IntArray | slice, must_contain: bool) -> None:
-            part = (t[rows], points[rows], facing[rows], shading[rows], front[rows])
+        def locate(rows: IntArray, must_contain: bool) -> None:
             kernels.locate(
-                wave.origins[rows], wave.directions[rows], polygon[rows], tracer._first_triangle, tracer._triangles,
-                tracer._corner_normals, must_contain, tracer.offset, *part,
+                rows, wave.origins, wave.directions, polygon, tracer._first_triangle, tracer._triangles,
+                tracer._corner_normals, must_contain, tracer.offset, t, points, facing, shading, front,
             )  # fmt: skip
-            if not isinstance(rows, slice):
-                t[rows], points[rows], facing[rows], shading[rows], front[rows] = part
 
-        left: IntArray | slice = slice(None)
+        rest = np.arange(count)
         if depth == 0 and self.guided is not None and "cast" in self.guided.guide.options.components:
             polygon[:] = self.guided.guide.polygon[self.guided.row]
             tried = np.flatnonzero(polygon != NO_POLYGON)
             locate(tried, True)
             self.tally.cast.assumed += len(tried)
-            left = np.flatnonzero(np.isinf(t))
-            self.tally.cast.saved += count - len(left)
-            self.tally.cast_misguided += len(tried) - (count - len(left))
-        rest = np.arange(count)[left]
+            rest = np.flatnonzero(np.isinf(t))
+            self.tally.cast.saved += count - len(rest)
+            self.tally.cast_misguided += len(tried) - (count - len(rest))
         if len(rest):
-            hits = tracer._all.closest_hit(wave.origins[rest], wave.directions[rest])
-            polygon[rest] = hits.polygon
+            whole = len(rest) == count
+            start = wave.origins if whole else wave.origins[rest]
+            along = wave.directions if whole else wave.directions[rest]
+            polygon[rest] = tracer._all.nearest_raw(*kernels.unit_rays(start, along, *tracer._all.frame))
             if depth == 0:
                 self.tally.cast.shot += len(rest)
-            met = rest[hits.polygon != NO_POLYGON]
-            locate(slice(None) if len(met) == count else met, False)
+            met = rest[polygon[rest] != NO_POLYGON]
+            locate(met, False)
             if not tracer.options.see_backs:
                 self._pass_backs(wave, met, t, polygon, front, locate)
         surface = tracer._surface[polygon]
@@ -645,19 +663,16 @@ class _Sweep:
         ray = np.flatnonzero(np.isfinite(t))
         if depth == 0:
             self.tally.cast_hits += len(ray)
-        agreed: NDArray[np.bool_] | None = None
+        agreed, pixel = np.zeros(len(ray), dtype=bool), np.empty(0, dtype=np.int64)
+        parts = (surface, points, facing, shading, front, wave.directions, wave.sample, wave.node)
+        if len(ray) < count:
+            parts = tuple(part.take(ray, axis=0) for part in parts)  # type: ignore[assignment]
+        surface, points, facing, shading, front, directions, sample, node = parts
         if self.guided is not None:
-            node = wave.node[ray]
-            agreed = node >= 0
-            # Node 0 stands in for none; the mask above rules it out.
-            agreed &= self.guided.guide.agrees(
-                self.guided.row[wave.sample[ray]], np.maximum(node, 0), surface[ray], shading[ray]
-            )
-        if len(ray) == count:
-            return _Found(ray, surface, points, facing, shading, front, wave.directions, agreed)
-        return _Found(
-            ray, surface[ray], points[ray], facing[ray], shading[ray], front[ray], wave.directions[ray], agreed
-        )
+            guide = self.guided.guide
+            pixel = self.guided.row[sample]
+            kernels.agreement(pixel, node, surface, shading, guide.surface, guide.normal, guide.cosine, agreed)
+        return _Found(ray, surface, points, facing, shading, front, directions, sample, node, pixel, agreed)
 
     def _pass_backs(
         self,
@@ -687,11 +702,10 @@ class _Sweep:
         assert self.record is not None
         recorded = wave.node >= 0
         self.record.surface[wave.sample[recorded], wave.node[recorded]] = NO_SURFACE
-        met = recorded[found.ray]
-        at = (wave.sample[found.ray[met]], wave.node[found.ray[met]])
-        self.record.surface[at] = found.surface[met]
+        met = found.node >= 0
+        self.record.surface[found.sample[met], found.node[met]] = found.surface[met]
         if self.record.normal is not None:
-            self.record.normal[at] = found.shading[met]
+            self.record.normal[found.sample[met], found.node[met]] = found.shading[met]
 
     # ---- lights
 
@@ -705,63 +719,43 @@ class _Sweep:
         leaving: FloatArray,
     ) -> None:
         """Add the light of every light to ``leaving`` (n, bands)."""
-        tracer, count = self.tracer, len(found.ray)
-        exponent = tracer._materials.highlight_exponent[found.surface]
-        shiny = bool((exponent >= 0.0).any())
-        sample, node = wave.sample[found.ray], wave.node[found.ray]
+        tracer, count, materials = self.tracer, len(found.ray), self.tracer._materials
         centre, unit = tracer._opaque.frame
-        bands = 1 if tracer._panes is None else tracer.bands
-        keys = wave.keys[found.ray]
-        nobody = np.full(count, COMPLEX_SHADOW, dtype=np.uint8)
-        recorded = np.flatnonzero(node >= 0)
+        keys = wave.keys[found.ray] if tracer.options.jitter else wave.keys[:0]
+        assumed = np.full(count, COMPLEX_SHADOW, dtype=np.uint8)
+        states = np.empty(count, dtype=np.uint8)
+        seen, out_of_cone = np.empty(count, dtype=np.int64), np.empty(count, dtype=bool)
+        size = count * max((light.samples for light in tracer._lights), default=0)
+        origin, along = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
+        weight, lobe_weight, owner = np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
+        recorded = found.node >= 0
         for index, light in enumerate(tracer._lights):
-            tally = self.tally.shadows[index]
-            assumed = nobody
-            if self.guided is not None and found.agreed is not None:
-                state = self.guided.guide.state[self.guided.row[sample], np.maximum(node, 0), index]
-                assumed = np.where(found.agreed, state, COMPLEX_SHADOW).astype(np.uint8)
+            if self.guided is not None:
+                kernels.assume(found.agreed, found.pixel, found.node, self.guided.guide.state, index, assumed)
             targets, axes = self._targets(light, index, keys)
-            size = count * light.samples
-            direct, shine = np.zeros((count, bands)), np.zeros((count, bands))
-            seen, out_of_cone = np.empty(count, dtype=np.int64), np.empty(count, dtype=bool)
-            origin, along = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
-            weight, lobe_weight, owner = np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
             rays = kernels.light_rays(
                 light.law, targets, axes, light.scale, light.cosine_cut, light.spot_exponent, light.falls,
-                light.highlight and shiny, tracer.offset, centre, unit,
-                found.points, found.facing, found.shading, mirrored, exponent, lit, assumed,
-                direct, shine, seen, out_of_cone, origin, along, weight, lobe_weight, owner,
+                light.highlight, light.power, tracer.offset, centre, unit,
+                found.points, found.facing, found.shading, mirrored, materials.highlight_exponent, lit, assumed,
+                reflectance, materials.specular, found.surface,
+                leaving, seen, out_of_cone, origin, along, weight, lobe_weight, owner,
             )  # fmt: skip
             through = tracer.transmitted(origin[:rays], along[:rays])
-            states = np.empty(count, dtype=np.uint8)
             kernels.gather_light(
-                rays, through, weight, lobe_weight, owner, lit, assumed, seen, out_of_cone, direct, shine, states
-            )
+                rays, through, weight, lobe_weight, owner, light.power, reflectance, materials.specular,
+                found.surface, assumed, out_of_cone, leaving, states,
+            )  # fmt: skip
+            tally = self.tally.shadows[index]
             tally.shot += rays
-            leaving += reflectance / np.pi * direct * light.power
-            if shiny and light.highlight:
-                leaving += tracer._materials.specular[found.surface] * shine * light.power
             if self.record is not None:
-                self.record.state[sample[recorded], node[recorded], index] = states[recorded]
+                self.record.state[found.sample[recorded], found.node[recorded], index] = states[recorded]
             if self.guided is not None:
-                self._note_saved(assumed, lit, seen, sample, tally)
-
-    def _note_saved(
-        self,
-        assumed: NDArray[np.uint8],
-        lit: NDArray[np.bool_],
-        seen: IntArray,
-        sample: IntArray,
-        tally: ComponentCount,
-    ) -> None:
-        """Count the shadow rays that an assumed state spared: one a sample above the horizon."""
-        rays = np.where((assumed != COMPLEX_SHADOW) & lit, seen, 0)
-        tally.assumed += int((rays > 0).sum())
-        tally.saved += int(rays.sum())
-        self.saved += np.bincount(sample, weights=rays, minlength=len(self.saved)).astype(np.int64)
+                points, spared = kernels.count_spared(assumed, lit, seen, found.sample, self.saved)
+                tally.assumed += points
+                tally.saved += spared
 
     def _targets(self, light: _Emitter, index: int, keys: NDArray[np.uint64]) -> tuple[FloatArray, FloatArray]:
-        if light.samples == 1 and light.law in (kernels.POINT, kernels.DIRECTIONAL):
+        if light.law in (kernels.POINT, kernels.DIRECTIONAL):
             return light.corners[:, :1], light.normals[None]
         jitter = self.tracer.options.jitter
         shape = (len(keys) if jitter else 1, light.samples, 3)
@@ -785,79 +779,92 @@ class _Sweep:
     ) -> None:
         """Add what reflected and refracted rays bring, all of them one wave."""
         materials = self.tracer._materials
-        reflecting = np.flatnonzero(materials.mirrors[found.surface] & lit)
-        passing = np.flatnonzero(materials.clear[found.surface])
-        reflecting = self._interpolate("reflection", wave, found, reflecting, materials.specular, leaving)
-        passing = self._interpolate("refraction", wave, found, passing, materials.transmittance, leaving)
+        reflecting = np.flatnonzero(materials.mirrors.take(found.surface) & lit)
+        passing = (
+            np.flatnonzero(materials.clear.take(found.surface))
+            if self.tracer._panes is not None
+            else np.empty(0, dtype=np.int64)
+        )
+        copies = self.tracer.options.bundle if depth == 0 else 1
+        if self.guided is not None:
+            reflecting = self._interpolate("reflection", found, reflecting, leaving, copies)
+            passing = self._interpolate("refraction", found, passing, leaving, copies)
         if len(reflecting) + len(passing) == 0:
             return
-        bent, inside = kernels.refract(
-            found.directions[passing], found.shading[passing], found.facing[passing], found.front[passing],
-            materials.ior[found.surface[passing]],
-        )  # fmt: skip
-        bundle = self.tracer.options.bundle
-        copies = bundle if depth == 0 else 1
-        waves = []
-        for branch, rows, along, side in (
-            (1, reflecting, mirrored[reflecting], np.ones(len(reflecting))),
-            (2, passing, bent, np.where(inside, 1.0, -1.0)),
-        ):
-            ray = found.ray[rows]
-            node = 2 * wave.node[ray] + branch
-            keys = kernels.child_keys(wave.keys[ray], branch, 1)
-            if bundle > 1:
-                exponents = materials.exponent[found.surface[rows]]
-                along = kernels.lobe(along, exponents, found.facing[rows], keys, copies)
-            start = found.points[rows] + (side * self.tracer.offset)[:, None] * found.facing[rows]
-            if copies > 1:
-                start = np.repeat(start, copies, axis=0)
-                keys = kernels.child_keys(keys, 3, copies)
-            # A bundle has no one node below it.
-            node = np.where((wave.node[ray] >= 0) & (node < self.nodes) & (copies == 1), node, -1)
-            waves.append(_Wave(start, along, keys, np.repeat(wave.sample[ray], copies), np.repeat(node, copies)))
-        self.tally.reflection.shot += len(waves[0].sample)
-        self.tally.refraction.shot += len(waves[1].sample)
-        both = _Wave(
-            np.concatenate([waves[0].origins, waves[1].origins]),
-            np.concatenate([waves[0].directions, waves[1].directions]),
-            np.concatenate([waves[0].keys, waves[1].keys]),
-            np.concatenate([waves[0].sample, waves[1].sample]),
-            np.concatenate([waves[0].node, waves[1].node]),
+        reflected = self._next(
+            wave, found, reflecting, mirrored.take(reflecting, axis=0), np.ones(len(reflecting)), 1, copies
         )
-        radiance = self.follow(both, depth + 1).reshape(-1, copies, self.tracer.bands)
-        brought = radiance.mean(axis=1) if copies > 1 else radiance[:, 0]
+        both = reflected
+        if len(passing):
+            bent, inside = kernels.refract(
+                found.directions[passing], found.shading[passing], found.facing[passing], found.front[passing],
+                materials.ior[found.surface[passing]],
+            )  # fmt: skip
+            refracted = self._next(wave, found, passing, bent, np.where(inside, 1.0, -1.0), 2, copies)
+            both = _Wave(
+                *(np.concatenate([getattr(w, part.name) for w in (reflected, refracted)]) for part in fields(_Wave))
+            )
+        self.tally.reflection.shot += len(reflecting) * copies
+        self.tally.refraction.shot += len(passing) * copies
+        brought = self.follow(both, depth + 1)
+        if copies > 1:
+            brought = brought.reshape(-1, copies, self.tracer.bands).mean(axis=1)
         for name, rows, values, share in (
             ("reflected", reflecting, brought[: len(reflecting)], materials.specular),
             ("refracted", passing, brought[len(reflecting) :], materials.transmittance),
         ):
-            leaving[rows] += share[found.surface[rows]] * values
+            if len(rows) == 0:
+                continue
+            kernels.add_share(rows, found.surface, share, values, leaving)
             if self.record is not None:
-                ray = found.ray[rows]
-                recorded = wave.node[ray] >= 0
-                at = (wave.sample[ray[recorded]], wave.node[ray[recorded]])
-                getattr(self.record, name)[at] = values[recorded]
+                node = found.node[rows]
+                recorded = node >= 0
+                getattr(self.record, name)[found.sample[rows[recorded]], node[recorded]] = values[recorded]
 
-    def _interpolate(
-        self, component: str, wave: _Wave, found: _Found, rows: IntArray, share: FloatArray, leaving: FloatArray
-    ) -> IntArray:
+    def _next(
+        self,
+        wave: _Wave,
+        found: _Found,
+        rows: IntArray,
+        along: FloatArray,
+        side: FloatArray,
+        branch: int,
+        copies: int,
+    ) -> _Wave:
+        """The reflected (``branch`` 1) or refracted (2) rays of some hits; ``side`` is -1 for those that go through."""
+        tracer = self.tracer
+        start = np.empty((len(rows), 3))
+        kernels.next_rays(rows, found.points, found.facing, side, tracer.offset, start)
+        keys = kernels.child_keys(wave.keys[found.ray[rows]], branch, 1)
+        sample, parent = found.sample[rows], found.node[rows]
+        node = 2 * parent + branch
+        if tracer.options.bundle > 1:
+            exponents = tracer._materials.exponent[found.surface[rows]]
+            along = kernels.lobe(along, exponents, found.facing[rows], keys, copies)
+        if copies > 1:
+            # A bundle has no one node below it.
+            return _Wave(
+                np.repeat(start, copies, axis=0), along, kernels.child_keys(keys, 3, copies),
+                np.repeat(sample, copies), np.full(len(rows) * copies, -1),
+            )  # fmt: skip
+        return _Wave(start, along, keys, sample, np.where((parent >= 0) & (node < self.nodes), node, -1))
+
+    def _interpolate(self, component: str, found: _Found, rows: IntArray, leaving: FloatArray, copies: int) -> IntArray:
         """Add what may be interpolated between the corners; returns the rows that need a ray."""
-        if self.guided is None or found.agreed is None or component not in self.guided.guide.options.components:
+        assert self.guided is not None
+        guide, materials = self.guided.guide, self.tracer._materials
+        if len(rows) == 0 or component not in guide.options.components:
             return rows
-        guide = self.guided.guide
-        spreads = guide.reflection_spread if component == "reflection" else guide.refraction_spread
-        corners = guide.reflected if component == "reflection" else guide.refracted
-        rows_agreed = rows[found.agreed[rows]]
-        ray = found.ray[rows_agreed]
-        pixel, node = self.guided.row[wave.sample[ray]], wave.node[ray]
-        most = share[found.surface[rows_agreed]].max(axis=1)
-        alike = spreads[pixel, node] * most <= guide.options.similar  # NaN, a missing ray, is not alike
-        chosen, ray = rows_agreed[alike], ray[alike]
-        sample = wave.sample[ray]
-        values = bilinear(corners[pixel[alike], node[alike]], self.guided.x[sample], self.guided.y[sample])
-        leaving[chosen] += share[found.surface[chosen]] * values
+        if component == "reflection":
+            spread, values, share = guide.reflection_spread, guide.trees.reflected, materials.specular
+        else:
+            spread, values, share = guide.refraction_spread, guide.trees.refracted, materials.transmittance
+        left = np.empty(len(rows), dtype=np.int64)
+        count = kernels.interpolate(
+            rows, found.agreed, found.sample, found.pixel, found.node, found.surface, share, spread, values,
+            guide.corners, self.guided.x, self.guided.y, guide.options.similar, leaving, left,
+        )  # fmt: skip
         tally: ComponentCount = getattr(self.tally, component)
-        tally.assumed += len(chosen)
-        tally.saved += len(chosen) * (self.tracer.options.bundle if np.all(wave.node == 0) else 1)
-        keep = np.ones(len(leaving), dtype=bool)
-        keep[chosen] = False
-        return rows[keep[rows]]
+        tally.assumed += len(rows) - count
+        tally.saved += (len(rows) - count) * copies
+        return left[:count]
