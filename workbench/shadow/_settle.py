@@ -89,12 +89,13 @@ def tile_candidates(
 def settle_points(
     points, normals, own, tile_start, first, last, sender, s0, s1, sender_normal, sender_own, corners, starts,
     piece_polygon, through, low, high, skip, head, leaf, order, bounds, slack, limit, lists, counts, share, open_share,
-    state, tally,
+    state, candidates, tally,
 ):  # fmt: skip
     """Settle the points of tiles ``first..last`` for one convex sender piece.
 
     ``open_share`` gets the unoccluded form factor of each point, ``share`` the visible one where it
-    is known, ``state`` CLEAR, DARK, EXACT or COMPLEX.  At most ``limit`` candidates are cut.
+    is known, ``state`` CLEAR, DARK, EXACT or COMPLEX, ``candidates`` the number of pieces left after
+    the culls.  At most ``limit`` are cut; ``limit + 1`` stands for that many or more.
     """
     planes = np.empty((64, 4))
     # Boxes that meet the pyramid: so many more than can be cut, and the point is for rays anyway.
@@ -111,14 +112,16 @@ def settle_points(
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
             value = 0.0
-            if mx * x + my * y + mz * z - level > 1e-3 * slack:
+            if mx * x + my * y + mz * z - level > slack:
                 value = lambert_piece(x, y, z, nx, ny, nz, sender, s0, s1)
                 tally[CLOSED] += 1
             if value <= 0.0:
                 tally[HORIZON] += 1
                 open_share[i], share[i], state[i] = 0.0, 0.0, STATE_DARK
+                candidates[i] = 0
                 continue
             open_share[i], share[i], state[i] = value, value, STATE_CLEAR
+            candidates[i] = 0
             if counts[t] == 0:
                 tally[CLEAR] += 1
                 continue
@@ -144,6 +147,7 @@ def settle_points(
                     kept += 1
                     if kept > limit:
                         break
+            candidates[i] = kept
             if kept == 0:
                 tally[CLEAR] += 1
                 continue

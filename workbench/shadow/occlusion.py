@@ -2,7 +2,7 @@
 
 A. Woo, "Efficient Shadow Computations in Ray Tracing" (IEEE CG&A 1993) marks a point, for one
 light, as in shadow, not in shadow, or complex.  :func:`estimate` finds the state, the visible part
-and the irradiance of points under polygonal area lights, by a method of choice.
+and the irradiance of points under lights of every kind, by a method of choice.
 """
 
 from __future__ import annotations
@@ -12,23 +12,39 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from workbench.accel.box_tree import BoxTree
+from workbench.accel.box_tree import BoxTree, boxes_meeting_planes
 from workbench.accel.embree import EmbreeAccelerator
+from workbench.accel.voxel_grid import VoxelGrid
 from workbench.arrays import as_points, as_unit_vectors
 from workbench.counters import Counters
 from workbench.culling.plane_vertex import CHECK_SLACK
-from workbench.culling.tally import TALLY, add_tally, new_tally
+from workbench.culling.shaft import MAX_SHAFT_PLANES, box_shaft
+from workbench.culling.tally import CLOSED, add_tally, new_tally
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
+from workbench.geometry.lambert import lambert_piece
 from workbench.geometry.polygons import check_polygon, convex_pieces, plane_basis, vector_area
-from workbench.shadow import _settle
-from workbench.shadow.rays import visible_shares
+from workbench.shadow import _sampled, _settle
+from workbench.shadow.area import MAX_CORNERS
+from workbench.shadow.hardware_camera import CameraState, camera_shadows
+from workbench.shadow.lights import (
+    DirectionalLight,
+    DiskLight,
+    LinearLight,
+    PointLight,
+    PolygonLight,
+    Sender,
+    SphereLight,
+)
+from workbench.shadow.linear import visible_linear_irradiance
+from workbench.shadow.rays import NOISE, visible_shares
 from workbench.shadow.smooth import fill_smoothly
 
 __all__ = ["METHODS", "AreaLight", "OcclusionEstimate", "OcclusionState", "Shader", "estimate"]
@@ -36,19 +52,29 @@ __all__ = ["METHODS", "AreaLight", "OcclusionEstimate", "OcclusionState", "Shade
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-METHODS = ("auto", "exact", "rays", "shaft")
+METHODS = ("adaptive", "auto", "camera", "camera-optimised", "exact", "rays", "rays+plane-vertex", "shaft")
 """Methods by name: see :func:`estimate`."""
+_UNCULLED = ("adaptive", "rays", "rays+plane-vertex")
+"""Methods that ask every point that faces the light."""
 
 TILE = 1024
 """Points a tile, about."""
-NOISE = 0.64
-"""Measured on a tessellated torus: K rays leave an error of NOISE K^-3/4 of a visible share."""
 MARGIN = 1.3
 """Errors of neighbouring fits partly cancel: measured errors stay below the asked one by this."""
 PILOT_POINTS = 256
 """Points that give a first idea of the mean irradiance."""
 CUT_LIMIT = 12
 """Longest candidate list that ``auto`` and ``shaft`` cut exactly."""
+LEAST_MEAN = 0.02
+"""``auto``: of darker scenes the error is asked relative to this share of the unoccluded irradiance."""
+LIFT = 1e-9
+"""Distance by which rays of the instrument begin and end off surfaces, as a share of the scene's size."""
+ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
+"""Rounding of a distance, as a share of the coordinates it is a difference of."""
+ROUND_CORNERS = 24
+"""Corners of the regular polygon that stands for a disk when it is cut, checked or drawn."""
+ROUND_ERROR = 0.0022
+"""Share of a disk that lies outside that polygon of its area, and so the most that it can be off."""
 
 
 class OcclusionState(IntEnum):
@@ -85,13 +111,18 @@ class OcclusionEstimate:
     Parameters
     ----------
     state : (n, l) int
-        :class:`OcclusionState` of each point for each light.
+        :class:`OcclusionState` of each point for each light.  Where nothing comes from the light
+        even unoccluded it is INSHADOW; what only rays have seen is COMPLEX_SHADOW.
     open_share, visible_share : (n, l) float
-        Form factor from the point to the light, unoccluded and with its occluders. [0..1]
+        Irradiance for a power of 1 in all bands, unoccluded and with the occluders: the form factor
+        from the point for lights that are surfaces.
     irradiance : (n, bands) float
         [W m-2]
     standard_error : (n, bands) float
         Estimated error of the irradiance. [W m-2]
+    candidates : (n, l) int
+        Convex pieces of occluders that the culls left, one more than a cut takes meaning that many
+        or more; -1 by methods that do not list them.
     counters : Counters
     seconds : dict
         Wall-clock seconds by stage.
@@ -102,6 +133,7 @@ class OcclusionEstimate:
     visible_share: FloatArray
     irradiance: FloatArray
     standard_error: FloatArray
+    candidates: IntArray
     counters: Counters
     seconds: dict[str, float]
 
@@ -163,6 +195,11 @@ def _tiles(points: FloatArray, normals: FloatArray, own: IntArray, size: float) 
     bounds = np.stack([np.minimum.reduceat(moved, start[:-1]), np.maximum.reduceat(moved, start[:-1])], axis=1)
     ordered = np.ascontiguousarray(normals[order])
     lead = start[:-1]
+    tile = np.repeat(np.arange(len(lead)), np.diff(start))
+    height = np.einsum("ij,ij->i", ordered[lead][tile], moved)
+    # Points of a tile lie on one plane to a billionth; its lowest point and tilt bound the horizon.
+    tilt = np.maximum.reduceat(np.abs(ordered - ordered[lead][tile]).max(axis=1), lead)
+    offset = np.minimum.reduceat(height, lead) - 4.0 * size * tilt
     return _Tiles(
         order=order,
         points=moved,
@@ -172,7 +209,7 @@ def _tiles(points: FloatArray, normals: FloatArray, own: IntArray, size: float) 
         start=start.astype(np.int64),
         bounds=np.ascontiguousarray(bounds),
         normal=np.ascontiguousarray(ordered[lead]),
-        offset=np.einsum("ij,ij->i", ordered[lead], moved[lead]),
+        offset=offset,
         polygon=np.ascontiguousarray(own[order][lead]),
     )
 
@@ -182,8 +219,77 @@ def _rays_for(error: float) -> int:
     return int(min(max((NOISE / error) ** (4.0 / 3.0), 16), 65536))
 
 
+@dataclass(frozen=True)
+class _Task:
+    """One light's question: how, how well, and where to count."""
+
+    method: str
+    error: float
+    samples: int
+    seed: int
+    slack: float
+    counters: Counters
+    seconds: dict[str, float]
+
+
+@dataclass
+class _Answer:
+    """One light's answers (n,), in the order of the tiles."""
+
+    open: FloatArray
+    seen: FloatArray
+    doubt: FloatArray
+    state: NDArray[np.int8]
+    candidates: IntArray
+
+    @classmethod
+    def sampled(cls, whole: FloatArray) -> _Answer:
+        """All dark so far, complex where light may come."""
+        state = np.where(whole > 0.0, OcclusionState.COMPLEX_SHADOW, OcclusionState.INSHADOW).astype(np.int8)
+        unknown = np.full(len(whole), -1, dtype=np.int64)
+        return cls(whole, np.zeros(len(whole)), np.zeros(len(whole)), state, unknown)
+
+
+def _round_ring(centre: FloatArray, radius: float, normal: FloatArray) -> FloatArray:
+    """A regular polygon (24, 3) of a disk's area, counter-clockwise about ``normal``."""
+    u, v = plane_basis(normal)
+    step = 2.0 * math.pi / ROUND_CORNERS
+    angle = step * np.arange(ROUND_CORNERS)
+    reach = radius * math.sqrt(step / math.sin(step))
+    return centre + reach * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v)
+
+
+def _sides(light: AreaLight | PolygonLight | DiskLight) -> list[list[FloatArray]]:
+    """Convex pieces of each emitting side, counter-clockwise from it, short enough to be cut."""
+    if isinstance(light, DiskLight):
+        pieces = [_round_ring(light.centre, light.radius, light.normal)]
+    elif isinstance(light, PolygonLight):
+        pieces = list(light.parts)
+    else:
+        polygon = as_points(light.polygon, "light")
+        problem = check_polygon([polygon])
+        if problem:
+            raise InputError(f"light: found {problem}, expected a planar polygon with an area")
+        pieces = convex_pieces([polygon])
+    short = []
+    for piece in pieces:
+        most = MAX_CORNERS - 4
+        short += [
+            np.concatenate([piece[:1], piece[i : i + most - 1]])
+            for i in (range(1, len(piece) - 1, most - 2) if len(piece) > most else [1])
+        ]
+    both = isinstance(light, (PolygonLight, DiskLight)) and light.two_sided
+    return [short, [np.ascontiguousarray(ring[::-1]) for ring in short]] if both else [short]
+
+
+def _power(light: AreaLight | Sender) -> FloatArray:
+    """What the light's share is multiplied by: exitance of a surface, intensity of others."""
+    power = light.radiance * math.pi if isinstance(light, AreaLight) else light.power
+    return np.atleast_1d(np.asarray(power, dtype=np.float64))
+
+
 class Shader:
-    """A geometry made ready for many questions: box tree, Embree scene, threads.
+    """A geometry made ready for many questions: box tree, Embree scene, voxels, threads.
 
     Parameters
     ----------
@@ -197,17 +303,29 @@ class Shader:
         self.workers = workers if workers is not None else len(os.sched_getaffinity(0))
         if self.workers < 1:
             raise OptionError(f"workers: found {workers}, expected 1 or more")
-        self.tracer = EmbreeAccelerator(geometry)
-        tree = BoxTree.build(geometry)
-        self._slack = CHECK_SLACK * geometry.size
+        self._box_tree = tree = BoxTree.build(geometry)
         self._through = np.ascontiguousarray(geometry.polygon_transmittance[geometry.piece_polygon])
         self._tree = (tree.low, tree.high, tree.skip, tree.first, tree.count, tree.order, geometry.piece_bounds)
+
+    @cached_property
+    def tracer(self) -> EmbreeAccelerator:
+        """Embree, for rays past opaque surfaces."""
+        return EmbreeAccelerator(self.geometry)
+
+    @cached_property
+    def grid(self) -> VoxelGrid:
+        """The instrument's voxels, for counted rays and for panes; a pane has one transmittance, its mean."""
+        grey = tuple(
+            replace(material, transmittance=np.full_like(material.transmittance, material.transmittance.mean()))
+            for material in self.geometry.surface_material
+        )
+        return VoxelGrid(replace(self.geometry, surface_material=grey), workers=self.workers)
 
     def estimate(
         self,
         points: ArrayLike,
         normals: ArrayLike,
-        lights: AreaLight | Sequence[AreaLight],
+        lights: AreaLight | Sender | Sequence[AreaLight | Sender],
         method: str = "auto",
         *,
         error: float = 0.01,
@@ -217,6 +335,8 @@ class Shader:
     ) -> OcclusionEstimate:
         """See :func:`estimate`."""
         where, facing = as_points(points), as_unit_vectors(normals)
+        if len(where) == 0:
+            raise InputError("points: found none, expected one or more")
         if len(facing) == 1 and len(where) > 1:
             facing = np.repeat(facing, len(where), axis=0)
         if len(facing) != len(where):
@@ -227,11 +347,13 @@ class Shader:
             raise OptionError(f"error: found {error}, expected a number between 0 and 1")
         if samples < 1:
             raise OptionError(f"samples: found {samples}, expected 1 or more")
-        if method != "exact" and self._through.any():
-            raise InputError(
-                f"method: {method!r} traces opaque surfaces only and the scene has transparent ones; use 'exact'"
-            )
-        chosen = [lights] if isinstance(lights, AreaLight) else list(lights)
+        chosen = list(lights) if isinstance(lights, Sequence) else [lights]
+        if not chosen:
+            raise InputError("lights: found none, expected one or more")
+        powers = [_power(light) for light in chosen]
+        bands = max(len(power) for power in powers)
+        if {len(power) for power in powers} - {1, bands}:
+            raise InputError(f"lights: found {sorted({len(p) for p in powers})} bands, expected as many for each light")
         own = np.full(len(where), -1, dtype=np.int64)
         if own_polygon is not None:
             own = np.ascontiguousarray(np.broadcast_to(np.asarray(own_polygon, dtype=np.int64), (len(where),)))
@@ -240,149 +362,340 @@ class Shader:
         start = time.perf_counter()
         tiles = _tiles(where, facing, own, self.geometry.size)
         seconds["tiles"] = time.perf_counter() - start
-        bands = max((len(light.radiance) for light in chosen), default=1)
-        state = np.zeros((len(where), len(chosen)), dtype=np.int8)
-        open_share, visible, doubt = (np.zeros((len(where), len(chosen))) for _ in range(3))
+        far = max(float(np.abs(where).max()), float(np.abs(self.geometry.bounds).max()))
+        slack = max(CHECK_SLACK * self.geometry.size, ROUNDING * far)
+        shape = (len(where), len(chosen))
+        state, candidates = np.zeros(shape, dtype=np.int8), np.zeros(shape, dtype=np.int64)
+        open_share, visible, doubt = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         for column, light in enumerate(chosen):
-            found = self._one_light(tiles, light, method, error, samples, seed + column, counters, seconds)
-            for target, values in zip((open_share, visible, doubt, state), found, strict=True):
-                target[tiles.order, column] = values
-        radiance = np.stack([np.broadcast_to(light.radiance, (bands,)) for light in chosen]) * math.pi
-        variance = doubt**2 @ radiance**2
-        return OcclusionEstimate(state, open_share, visible, visible @ radiance, np.sqrt(variance), counters, seconds)
+            answer = self._one_light(
+                tiles, light, _Task(method, error, samples, seed + column, slack, counters, seconds)
+            )
+            open_share[tiles.order, column] = answer.open
+            visible[tiles.order, column] = answer.seen
+            doubt[tiles.order, column] = answer.doubt
+            state[tiles.order, column] = answer.state
+            candidates[tiles.order, column] = answer.candidates
+        power = np.stack([np.broadcast_to(each, (bands,)) for each in powers])
+        variance = doubt**2 @ power**2
+        return OcclusionEstimate(
+            state, open_share, visible, visible @ power, np.sqrt(variance), candidates, counters, seconds
+        )
 
-    def _one_light(
-        self,
-        tiles: _Tiles,
-        light: AreaLight,
-        method: str,
-        error: float,
-        samples: int,
-        seed: int,
-        counters: Counters,
-        seconds: dict[str, float],
-    ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int8]]:
-        polygon = as_points(light.polygon, "light")
-        problem = check_polygon([polygon])
-        if problem:
-            raise InputError(f"light: found {problem}, expected a planar polygon with an area")
-        pieces = convex_pieces([polygon])
-        normal = vector_area(polygon)
+    def _one_light(self, tiles: _Tiles, light: AreaLight | Sender, task: _Task) -> _Answer:
+        if isinstance(light, (DirectionalLight, PointLight)):
+            return self._single_rays(tiles, light, task)
+        if isinstance(light, LinearLight):
+            return self._linear(tiles, light, task)
+        if isinstance(light, SphereLight):
+            return self._sphere(tiles, light, task)
+        if not isinstance(light, (AreaLight, PolygonLight, DiskLight)):
+            raise InputError(f"light: found {type(light).__name__}, expected an AreaLight or one of shadow.lights")
+        if isinstance(light, AreaLight):
+            polygons = np.asarray([light.polygon_id] if light.polygon_id >= 0 else [], dtype=np.int64)
+        else:
+            polygons = light.polygons
+        answer: _Answer | None = None
+        for side in _sides(light):
+            found = self._side(tiles, side, polygons, task)
+            if answer is None:
+                answer = found
+                continue
+            facing = found.open > 0.0  # no point sees both sides
+            answer.state[facing] = found.state[facing]
+            for name in ("open", "seen", "doubt", "candidates"):
+                getattr(answer, name)[facing] = getattr(found, name)[facing]
+        assert answer is not None
+        if isinstance(light, DiskLight):
+            whole = light.unit_irradiance(tiles.points, tiles.normals)
+            self._rounded(answer, whole)
+        return answer
+
+    def _rounded(self, answer: _Answer, whole: FloatArray) -> None:
+        """Turn answers for a polygon into those of the disk that it stands for."""
+        scale = whole / np.where(answer.open > 0.0, answer.open, 1.0)
+        answer.seen, answer.doubt = answer.seen * scale, answer.doubt * scale
+        partly = answer.state == OcclusionState.COMPLEX_SHADOW
+        answer.doubt[partly] = np.hypot(answer.doubt, ROUND_ERROR * whole)[partly]
+        answer.open = whole
+
+    def _bundle(self, tiles: _Tiles, rows: IntArray, count: int, task: _Task) -> _sampled.Bundle:
+        return _sampled.Bundle(
+            tiles.points[rows], tiles.normals[rows], tiles.order[rows], tiles.own[rows], count, task.seed, self.workers,
+            LIFT * self.geometry.size + 4.0 * task.slack,
+        )  # fmt: skip
+
+    # ---- lights without area ------------------------------------------------------------------
+
+    def _single_rays(self, tiles: _Tiles, light: Sender, task: _Task) -> _Answer:
+        """Lights of one place or direction: whatever the method, one ray a point."""
+        answer = _Answer.sampled(light.unit_irradiance(tiles.points, tiles.normals))
+        rows = np.flatnonzero(answer.open > 0.0)
+        share, _ = _sampled.sender_shares(self.grid, self._bundle(tiles, rows, 1, task), light, task.counters)
+        answer.seen[rows] = share * answer.open[rows]
+        answer.state[rows[share == 1.0]] = OcclusionState.NOT_INSHADOW
+        answer.state[rows[share == 0.0]] = OcclusionState.INSHADOW
+        return answer
+
+    def _linear(self, tiles: _Tiles, light: LinearLight, task: _Task) -> _Answer:
+        """A linear light: exact past opaque surfaces, otherwise by rays."""
+        answer = _Answer.sampled(light.unit_irradiance(tiles.points, tiles.normals))
+        rows = np.flatnonzero(answer.open > 0.0)
+        if not len(rows):
+            return answer
+        bundle = self._bundle(tiles, rows, task.samples, task)
+        method = task.method
+        if method.startswith("camera"):
+            raise OptionError(f"method: found {method!r} for the linear light {light.name!r}; cameras see areas only")
+        if method == "exact" and self._through.any():
+            raise InputError("method: found 'exact' for a linear light behind panes; use 'rays'")
+        if method in ("exact", "shaft", "auto") and not self._through.any():
+            pieces = self._pieces_toward(bundle.place, np.stack([light.start, light.end]), task)
+            found = visible_linear_irradiance(
+                self.geometry, bundle.place, bundle.normals, light.start, light.end, lambertian=light.lambertian,
+                skip_polygons=bundle.skip(-1), pieces=pieces, workers=self.workers,
+            )  # fmt: skip
+            answer.seen[rows] = found.irradiance
+            answer.state[rows[found.visible_length == 1.0]] = OcclusionState.NOT_INSHADOW
+            answer.state[rows[found.irradiance == 0.0]] = OcclusionState.INSHADOW
+            answer.candidates[rows] = len(pieces)
+            return answer
+        if method == "adaptive":
+            share, doubt = _sampled.adaptive_linear_shares(self.grid, bundle, light, task.counters)
+        else:
+            share, doubt = _sampled.linear_shares(
+                self.grid, bundle, light, method == "rays+plane-vertex", task.counters
+            )
+        answer.seen[rows] = share * answer.open[rows]
+        answer.doubt[rows] = doubt * answer.open[rows]
+        return answer
+
+    def _pieces_toward(self, points: FloatArray, light: FloatArray, task: _Task) -> IntArray:
+        """Pieces whose boxes meet the shaft from the box of all points to that of a light."""
+        planes = np.empty((MAX_SHAFT_PLANES, 4))
+        used = box_shaft(points.min(axis=0), points.max(axis=0), light.min(axis=0), light.max(axis=0), planes)
+        found, tally = np.empty(self.geometry.piece_count, dtype=np.int64), new_tally()
+        many = boxes_meeting_planes(*self._tree, planes, used, 4.0 * task.slack, found, tally)
+        add_tally(task.counters, tally)
+        return np.sort(found[:many])
+
+    def _sphere(self, tiles: _Tiles, light: SphereLight, task: _Task) -> _Answer:
+        """A sphere: from each point a disk of its own; rays to the cap that it sees."""
+        answer = _Answer.sampled(light.unit_irradiance(tiles.points, tiles.normals))
+        rows = np.flatnonzero(answer.open > 0.0)
+        if task.method == "exact":
+            answer.candidates[:] = 0
+            owners, polygon = self._owners(light.polygons)
+            part, tally = np.zeros(len(tiles.points)), new_tally()
+            for i in rows.tolist():
+                toward = light.centre - tiles.points[i]
+                distance = float(np.linalg.norm(toward))
+                square = (light.radius / distance) ** 2
+                normal = -toward / distance
+                ring = _round_ring(
+                    tiles.points[i] + (1.0 - square) * toward, light.radius * math.sqrt(1.0 - square), normal
+                )
+                (x, y, z), (nx, ny, nz) = tiles.points[i], tiles.normals[i]
+                part[i] = lambert_piece(x, y, z, nx, ny, nz, ring, 0, len(ring))
+                _settle.exact_points(
+                    np.array([i]), tiles.points, tiles.normals, tiles.own, ring, 0, len(ring), normal, polygon,
+                    self.geometry.corners, self.geometry.piece_start, owners, self._through, *self._tree, task.slack,
+                    answer.seen, answer.doubt, tally,
+                )  # fmt: skip
+            add_tally(task.counters, tally)
+            scale = answer.open[rows] / np.where(part[rows] > 0.0, part[rows], 1.0)
+            cut = answer.seen[rows] < part[rows]
+            answer.seen[rows] *= scale
+            answer.doubt[rows] = answer.doubt[rows] * scale + np.where(cut, ROUND_ERROR * answer.open[rows], 0.0)
+            answer.state[rows[answer.seen[rows] == 0.0]] = OcclusionState.INSHADOW
+            return answer
+        if task.method in ("rays+plane-vertex", "adaptive") or task.method.startswith("camera"):
+            raise OptionError(f"method: found {task.method!r} for the sphere {light.name!r}; use rays, auto or exact")
+        count = _rays_for(task.error) if task.method == "auto" else task.samples
+        share, doubt = _sampled.sender_shares(self.grid, self._bundle(tiles, rows, count, task), light, task.counters)
+        answer.seen[rows] = share * answer.open[rows]
+        answer.doubt[rows] = doubt * answer.open[rows]
+        return answer
+
+    # ---- polygons -----------------------------------------------------------------------------
+
+    def _owners(self, polygons: IntArray) -> tuple[IntArray, int]:
+        """The polygon of each piece, all polygons of a light under one number, and that number."""
+        owners = self.geometry.piece_polygon
+        if len(polygons) > 1:
+            owners = np.where(np.isin(owners, polygons), polygons[0], owners)
+        return owners, int(polygons[0]) if len(polygons) else -1
+
+    def _side(self, tiles: _Tiles, pieces: list[FloatArray], polygons: IntArray, task: _Task) -> _Answer:
+        """One emitting side of a flat light, given as convex pieces."""
+        normal = vector_area(pieces[0])
         normal /= np.linalg.norm(normal)
+        if task.method.startswith("camera"):
+            return self._camera(tiles, pieces, normal, polygons, task)
+        owners, polygon = self._owners(polygons)
         n = len(tiles.points)
         whole, seen, doubt = np.zeros(n), np.zeros(n), np.zeros(n)
-        complex_parts: list[tuple[FloatArray, IntArray]] = []
+        waiting_parts: list[tuple[FloatArray, IntArray, FloatArray]] = []
         lit, dark = np.ones(n, dtype=bool), np.ones(n, dtype=bool)
+        candidates = np.full(n, -1 if task.method in _UNCULLED else 0, dtype=np.int64)
         for ring in pieces:
             begin = time.perf_counter()
-            part, share, state = self._settle(tiles, ring, normal, light.polygon_id, method, counters)
-            seconds["settle"] = seconds.get("settle", 0.0) + time.perf_counter() - begin
+            part, share, state, left = self._settle(tiles, ring, normal, owners, polygon, task)
+            task.seconds["settle"] = task.seconds.get("settle", 0.0) + time.perf_counter() - begin
             whole += part
+            if task.method not in _UNCULLED:
+                candidates += left
             waiting = np.flatnonzero(state == _settle.STATE_COMPLEX)
-            if len(waiting) and method == "exact":
+            known = np.ones(n, dtype=bool)
+            if task.method == "exact":
                 begin = time.perf_counter()
-                self._cut(tiles, waiting, ring, normal, light.polygon_id, share, doubt, counters)
-                seconds["cut"] = seconds.get("cut", 0.0) + time.perf_counter() - begin
-                waiting = waiting[:0]
-            known = state != _settle.STATE_COMPLEX if method != "exact" else np.ones(n, dtype=bool)
+                self._cut(tiles, waiting, ring, normal, owners, polygon, share, doubt, task)
+                task.seconds["cut"] = task.seconds.get("cut", 0.0) + time.perf_counter() - begin
+            else:
+                known[waiting] = False
+                waiting_parts.append((ring, waiting, part))
             seen[known] += share[known]
             lit &= (state == _settle.STATE_CLEAR) | (part == 0.0)
-            dark &= (state == _settle.STATE_DARK) | (known & (share == 0.0))
+            dark &= known & (share == 0.0)
+        for ring, waiting, part in waiting_parts:
             if len(waiting):
-                complex_parts.append((ring, waiting))
-        for ring, waiting in complex_parts:
-            begin = time.perf_counter()
-            part = whole if len(pieces) == 1 else self._open(tiles, ring, normal)
-            self._trace(
-                tiles, waiting, ring, normal, method, error, samples, seed, part, seen, doubt, counters
-            )  # fmt: skip
-            seconds["rays"] = seconds.get("rays", 0.0) + time.perf_counter() - begin
+                begin = time.perf_counter()
+                self._trace(tiles, waiting, ring, normal, polygon, part, seen, doubt, task)
+                task.seconds["rays"] = task.seconds.get("rays", 0.0) + time.perf_counter() - begin
         state = np.full(n, OcclusionState.COMPLEX_SHADOW, dtype=np.int8)
         state[lit] = OcclusionState.NOT_INSHADOW
         state[dark] = OcclusionState.INSHADOW
-        return whole, seen, doubt, state
+        return _Answer(whole, seen, doubt, state, candidates)
 
     def _settle(
-        self, tiles: _Tiles, ring: FloatArray, normal: FloatArray, own: int, method: str, counters: Counters
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.int8]]:
-        """Unoccluded and (where known) visible form factors to one convex piece, and states."""
+        self, tiles: _Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, task: _Task
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.int8], IntArray]:
+        """Unoccluded and (where known) visible form factors to a convex piece, states, candidates left."""
         geo = self.geometry
+        culled = task.method not in _UNCULLED
         n, count = len(tiles.points), len(tiles.start) - 1
         part, share = np.zeros(n), np.zeros(n)
-        state = np.zeros(n, dtype=np.int8)
-        counts = np.full(count, -1, dtype=np.int64)
+        state, left = np.zeros(n, dtype=np.int8), np.zeros(n, dtype=np.int64)
+        counts = np.full(count, -1 if culled else 0, dtype=np.int64)  # 0: only the open form factors are asked for
         lists = np.empty((count, _settle.MAX_CANDIDATES), dtype=np.int64)
         low, high = ring.min(axis=0), ring.max(axis=0)
-        limit = CUT_LIMIT if method in ("auto", "shaft") else (64 if method == "exact" else 0)
+        limit = 64 if task.method == "exact" else CUT_LIMIT
         step = max(1, -(-count // 64))
-        if method == "rays":
-            counts[:] = 0  # brute force knows no candidates: it asks for the open form factors only
 
         def work(first: int) -> NDArray[np.int64]:
             last = min(first + step, count)
             tally = new_tally()
-            if method != "rays":
+            if culled:
                 _settle.tile_candidates(
                     tiles.bounds, tiles.normal, tiles.offset, tiles.polygon, first, last, ring, low, high, normal, own,
-                    geo.corners, geo.piece_start, geo.piece_polygon, *self._tree, self._slack, lists, counts, tally,
+                    geo.corners, geo.piece_start, owners, *self._tree, task.slack, lists, counts, tally,
                 )  # fmt: skip
             _settle.settle_points(
                 tiles.points, tiles.normals, tiles.own, tiles.start, first, last, ring, 0, len(ring), normal, own,
-                geo.corners, geo.piece_start, geo.piece_polygon, self._through, *self._tree, self._slack, limit, lists,
-                counts, share, part, state, tally,
+                geo.corners, geo.piece_start, owners, self._through, *self._tree, task.slack, limit, lists,
+                counts, share, part, state, left, tally,
             )  # fmt: skip
             return tally
 
         with ThreadPoolExecutor(self.workers) as pool:
             for tally in pool.map(work, range(0, count, step)):
-                found = dict(zip(TALLY, tally.tolist(), strict=True))
-                counters.add(**({"closed_forms": found["closed_forms"]} if method == "rays" else found))
-        if method == "rays":
+                if culled:
+                    add_tally(task.counters, tally)
+                else:
+                    task.counters.add(closed_forms=tally[CLOSED])
+        if not culled:
             state[state == _settle.STATE_CLEAR] = _settle.STATE_COMPLEX
-        return part, share, state
+        return part, share, state, left
 
     def _cut(
-        self, tiles: _Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, own: int, share: FloatArray,
-        doubt: FloatArray, counters: Counters,
+        self, tiles: _Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int,
+        share: FloatArray, doubt: FloatArray, task: _Task,
     ) -> None:  # fmt: skip
         """Exact cuts at crowded points, the light quartered as far as needed."""
         geo = self.geometry
+        unsure = np.zeros(len(tiles.points))
 
         def work(block: IntArray) -> NDArray[np.int64]:
             tally = new_tally()
             _settle.exact_points(
                 block, tiles.points, tiles.normals, tiles.own, ring, 0, len(ring), normal, own, geo.corners,
-                geo.piece_start, geo.piece_polygon, self._through, *self._tree, self._slack, share, doubt, tally,
+                geo.piece_start, owners, self._through, *self._tree, task.slack, share, unsure, tally,
             )  # fmt: skip
             return tally
 
         with ThreadPoolExecutor(self.workers) as pool:
             for tally in pool.map(work, np.array_split(waiting, max(1, len(waiting) // 256))):
-                add_tally(counters, tally)
+                add_tally(task.counters, tally)
+        doubt += unsure
+
+    def _camera(
+        self, tiles: _Tiles, pieces: list[FloatArray], normal: FloatArray, polygons: IntArray, task: _Task
+    ) -> _Answer:
+        """Cameras at the points; what no camera sees well is cut exactly."""
+        geo = self.geometry
+        open_task = replace(task, method="rays")
+        whole = np.zeros(len(tiles.points))
+        for ring in pieces:
+            whole += self._settle(tiles, ring, normal, geo.piece_polygon, -1, open_task)[0]
+        answer = _Answer.sampled(whole)
+        viewport = min(max(round(math.sqrt(task.samples)), 2), 1024)
+        begin = time.perf_counter()
+        found = camera_shadows(
+            tiles.points, tiles.normals, pieces, geo, viewport=viewport,
+            mode="naive" if task.method == "camera" else "optimised", jitter="rotate", seed=task.seed,
+            own_polygon=tiles.own, ignore=polygons if len(polygons) else None, tree=self._box_tree,
+            workers=self.workers,
+        )  # fmt: skip
+        task.counters.merge(found.counters)
+        task.seconds["camera"] = task.seconds.get("camera", 0.0) + time.perf_counter() - begin
+        known = ~found.fallback
+        answer.seen[known] = found.visible_share[known] * answer.open[known]
+        rendered = found.state == CameraState.RENDERED
+        answer.doubt[rendered] = NOISE * viewport**-1.5 * answer.open[rendered]  # pixels err as as many rays do
+        facing = answer.open > 0.0
+        answer.state[facing & (found.state == CameraState.NOT_INSHADOW)] = OcclusionState.NOT_INSHADOW
+        answer.state[facing & (found.state == CameraState.INSHADOW)] = OcclusionState.INSHADOW
+        rows = np.flatnonzero(found.fallback & facing)
+        if len(rows):
+            left = _tiles(tiles.points[rows], tiles.normals[rows], tiles.own[rows], geo.size)
+            cut = self._side(left, pieces, polygons, replace(task, method="exact"))
+            answer.seen[rows[left.order]] = cut.seen
+            answer.doubt[rows[left.order]] = cut.doubt
+            answer.state[rows[left.order]] = cut.state
+        return answer
 
     def _trace(
-        self, tiles: _Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, method: str, error: float,
-        samples: int, seed: int, part: FloatArray, seen: FloatArray, doubt: FloatArray, counters: Counters,
+        self, tiles: _Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, polygon: int, part: FloatArray,
+        seen: FloatArray, doubt: FloatArray, task: _Task,
     ) -> None:  # fmt: skip
         """Rays at the points that are left, all of them or as many as a smooth fit needs."""
         n = len(tiles.points)
         share, spread = np.zeros(n), np.zeros(n)
 
         def sample(rows: IntArray, count: int) -> FloatArray:
-            value, half = visible_shares(
-                self.tracer, tiles.points[rows], tiles.normals[rows], tiles.order[rows], [ring], normal, count=count,
-                seed=seed, workers=self.workers,
-            )  # fmt: skip
-            counters.add(rays=len(rows) * count)
-            spread[rows] = half
+            bundle = self._bundle(tiles, rows, count, task)
+            if task.method == "adaptive":
+                value, noise = _sampled.adaptive_shares(self.grid, bundle, ring, normal, polygon, task.counters)
+            elif task.method == "rays+plane-vertex" or self._through.any():
+                value, noise = _sampled.woo_shares(
+                    self.grid, bundle, ring, normal, polygon, task.method == "rays+plane-vertex", task.counters
+                )
+            else:
+                value, noise = visible_shares(
+                    self.tracer, bundle.points, bundle.normals, bundle.index, [ring], normal, count=count,
+                    seed=task.seed, workers=self.workers,
+                )  # fmt: skip
+                task.counters.add(rays=len(rows) * count)
+            spread[rows] = noise
             return value
 
-        if method == "auto":
+        if task.method == "auto":
             # The error is asked of the irradiance over all points: what may a share here be off by?
             pilot = waiting[:: max(1, len(waiting) // PILOT_POINTS)]
             mean = (seen.sum() + float((sample(pilot, 16) * part[pilot]).mean()) * len(waiting)) / n
+            mean = max(mean, LEAST_MEAN * float(part.mean()))
             weight = math.sqrt(float((part[waiting] ** 2).sum()) / n)
-            allowed = min(max(MARGIN * error * mean / weight, 1e-5), 0.25)
+            allowed = min(max(MARGIN * task.error * mean / weight, 1e-5), 0.25)
             # Rows of the complex points only, tile by tile.
             tile = np.searchsorted(tiles.start, waiting, side="right") - 1
             edges = np.concatenate([[0], np.flatnonzero(np.diff(tile)) + 1, [len(waiting)]])
@@ -393,20 +706,15 @@ class Shader:
             )  # fmt: skip
             share[waiting], spread[waiting] = local, fitted
         else:
-            share[waiting] = sample(waiting, samples)
+            share[waiting] = sample(waiting, task.samples)
         seen[waiting] += share[waiting] * part[waiting]
         doubt[waiting] += spread[waiting] * part[waiting]
-
-    def _open(self, tiles: _Tiles, ring: FloatArray, normal: FloatArray) -> FloatArray:
-        """Unoccluded form factors to one convex piece."""
-        part, _, _ = self._settle(tiles, ring, normal, -1, "rays", Counters())
-        return part
 
 
 def estimate(
     points: ArrayLike,
     normals: ArrayLike,
-    lights: AreaLight | Sequence[AreaLight],
+    lights: AreaLight | Sender | Sequence[AreaLight | Sender],
     geometry: Geometry,
     method: str = "auto",
     *,
@@ -416,26 +724,40 @@ def estimate(
     own_polygon: ArrayLike | None = None,
     workers: int | None = None,
 ) -> OcclusionEstimate:
-    """Occlusion state, visible share and irradiance of points under polygonal area lights.
+    """Occlusion state, visible share and irradiance of points under lights of any kind.
 
     Parameters
     ----------
     points : (n, 3) float
     normals : (n, 3) or (3,) float
         Normals of the receiving side (any length but zero).
-    lights : AreaLight or sequence of them
+    lights : AreaLight, a sender of :mod:`workbench.shadow.lights`, or a sequence of them
     geometry : Geometry
-        The occluders; a light may be one of its polygons.
+        The occluders; a light may be one of its polygons.  A pane lets its mean transmittance
+        over the bands pass.
     method : str
         ``rays`` -- ``samples`` rays at every point that faces the light, without culling.
+        ``rays+plane-vertex`` -- the same rays through the instrument's voxels, polygons set aside by
+        Woo's check; all is counted.
+        ``adaptive`` -- Woo's adaptive linear light and its area counterpart: corners first, more where
+        they differ, about ``samples`` rays where all differ.  Corners that agree are believed, so
+        small shadows are missed; the standard error allows for a tenth of the light.
+        ``camera``, ``camera-optimised`` -- pictures of the light with ``samples`` pixels, at every point
+        or only where the plane-vertex check leaves occluders; exact cuts where no camera sees well.
         ``shaft`` -- shafts and light pyramids first, exact cuts of short lists, rays for the rest.
         ``exact`` -- every point cut exactly, the light quartered where it is crowded.
         ``auto`` -- as ``shaft``, with as many rays as ``error`` asks, and only at as many points of a
         tile as a smooth fit needs.
+
+        Lights without extent are settled by their one ray, whatever the method.  Linear lights are
+        exact by ``exact``, ``shaft`` and ``auto``.  A disk is sampled, cut and drawn as a regular polygon
+        of 24 corners and its area, off by at most 0.0022 of the disk; from a sphere ``exact``
+        cuts the disk that each point sees, other methods shoot rays.
     error : float
-        ``auto``: wanted error, root mean square over the points, relative to their mean irradiance.
+        ``auto``: wanted error, root mean square over the points, relative to their mean irradiance
+        (or to a fiftieth of the unoccluded one, if that is more).
     samples : int
-        ``rays`` and ``shaft``: rays a point.
+        Rays a point and convex piece of a light, or pixels a picture.
     seed : int
     own_polygon : (n,) int or int, optional
         Polygon of the geometry on which each point lies, which never shadows it; -1 for none.
@@ -448,7 +770,8 @@ def estimate(
     Raises
     ------
     InputError, OptionError
-        If an argument has another shape or lies out of range.
+        If an argument has another shape or lies out of range, or a method does not know a light:
+        cameras see no panes and no lines, and a sphere has no edges to check.
     """
     return Shader(geometry, workers).estimate(
         points, normals, lights, method, error=error, samples=samples, seed=seed, own_polygon=own_polygon

@@ -94,7 +94,10 @@ def fill_smoothly(
     while len(rows):
         edges = np.concatenate([[0], np.cumsum(sizes)])
         tile = np.repeat(np.arange(len(sizes)), sizes)
-        small = sizes <= SMALLEST
+        low = np.minimum.reduceat(flat[rows], edges[:-1])
+        high = np.maximum.reduceat(flat[rows], edges[:-1])
+        # Points all at one place cannot be cut apart.
+        small = (sizes <= SMALLEST) | (low == high).all(axis=1)
         direct = rows[small[tile]]
         if len(direct):
             share[direct] = sample(direct, error)
@@ -106,8 +109,7 @@ def fill_smoothly(
             break
         edges = np.concatenate([[0], np.cumsum(sizes)])
         tile = np.repeat(np.arange(len(sizes)), sizes)
-        low = np.minimum.reduceat(flat[rows], edges[:-1])
-        high = np.maximum.reduceat(flat[rows], edges[:-1])
+        low, high = low[~small], high[~small]
         middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-300)
         place = (flat[rows] - middle[tile]) / half[tile]
         chosen = np.empty((len(sizes), NODES), dtype=np.int64)
