@@ -72,7 +72,7 @@ class AtomicOptions:
 
     components: tuple[str, ...] = COMPONENTS
     whole_tree: bool = False
-    similar: float = 0.03
+    similar: float = 0.06
     normal_angle_deg: float | None = None
 
     def __post_init__(self) -> None:
@@ -90,7 +90,8 @@ class RayTrees:
     """What samples found, a row a sample and a column a node of the ray tree.
 
     Node 0 is the cast ray; node ``k`` has the reflected ray ``2 k + 1`` and the refracted ray
-    ``2 k + 2`` (a binary heap, the fixed stack of the paper).
+    ``2 k + 2`` (a binary heap, the fixed stack of the paper), or in a scene without anything
+    transparent only the reflected ray ``k + 1``.
 
     Parameters
     ----------

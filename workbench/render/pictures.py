@@ -271,7 +271,7 @@ def _ball(radius: float) -> FloatArray:
     )
 
 
-def _sphere(name: str, material: Material, centre: ArrayLike, radius: float, segments: int = 128) -> Surface:
+def _sphere(name: str, material: Material, centre: ArrayLike, radius: float, segments: int = 64) -> Surface:
     """An exact sphere: a half circle of three rational spans, revolved."""
     w = math.sqrt(0.5)
     profile = [(0, -1), (1, -1), (1, 0), (1, 1), (0, 1)]
@@ -283,14 +283,24 @@ def _sphere(name: str, material: Material, centre: ArrayLike, radius: float, seg
 def _spheres(width: int, height: int) -> TestPicture:
     floor = _material("stone", (0.8, 0.78, 0.74), 0.12, 40.0)
     colours = [(0.3, 0.08, 0.07), (0.08, 0.2, 0.32), (0.28, 0.22, 0.06), (0.12, 0.26, 0.1), (0.2, 0.2, 0.22)]
-    mirrors = [_material(f"mirror {i}", colour, 0.55, 200.0) for i, colour in enumerate(colours)]
+    mirrors = [_material(f"mirror {i}", colour, 0.32, 200.0) for i, colour in enumerate(colours)]
     places = [(-1.7, 0.4, 1.0, 1.0), (0.6, 1.5, 1.25, 1.25), (1.9, -0.7, 0.75, 0.75), (-0.3, -1.2, 0.6, 0.6),
               (-2.7, -1.5, 0.45, 0.45), (3.4, 1.2, 0.9, 0.9), (0.9, -2.2, 0.35, 0.35)]  # fmt: skip
-    surfaces = [_sheet("floor", floor, (-14, -8, 0), (28, 0, 0), (0, 30, 0), 40)]
+    wall = _material("wall", (0.42, 0.5, 0.58), 0.06, 15.0)
+    low, high = np.array([-9.0, -9.0, 0.0]), np.array([9.0, 9.0, 9.5])
+    x, y, z = np.diag(high - low)
+    surfaces = [
+        _sheet("floor", floor, low, x, y, 12),
+        _sheet("ceiling", wall, low + z, y, x, 12),
+        _sheet("left wall", wall, low, y, z, 12),
+        _sheet("right wall", wall, low + x, z, y, 12),
+        _sheet("near wall", wall, low, z, x, 12),
+        _sheet("far wall", wall, low + y, x, z, 12),
+    ]
     surfaces += [
         _sphere(f"sphere {i}", mirrors[i % len(mirrors)], place[:3], place[3]) for i, place in enumerate(places)
     ]
-    textures: dict[str, Texture] = {"floor": Noise(0.06, (0.5, 0.46, 0.42), 1.0, 2, 3.0, seed=1)}
+    textures: dict[str, Texture] = {"floor": Noise(0.06, (0.55, 0.5, 0.46), 1.0, 2, 3.0, seed=1)}
     lights = (
         _point("left", (-6.0, -5.0, 7.0), 1.1, (1.0, 0.95, 0.85)),
         _point("right", (5.5, -4.0, 6.0), 0.8, (0.85, 0.92, 1.0)),
@@ -298,7 +308,7 @@ def _spheres(width: int, height: int) -> TestPicture:
     )
     scene = Scene(
         "mirror spheres", tuple(surfaces), lights, _camera((0.2, -6.6, 5.4), (0.3, 0.0, 0.45), 38.0, width, height),
-        background=np.array([0.25, 0.35, 0.5]),
+        background=np.zeros(3),
     )  # fmt: skip
     return TestPicture(scene, textures, TraceOptions(falloff=False, ambient=0.1))
 
@@ -317,12 +327,12 @@ def _tori(width: int, height: int) -> TestPicture:
         _moved(_mesh("torus 3", metals[3], torus(0.6, 0.18), 96, 40), (1.9, -0.4, 0.8), turn_deg=-40.0, tilt_deg=65.0),
     ]
     textures: dict[str, Texture] = {
-        "floor": Noise(0.12, (0.35, 0.35, 0.4), 1.0, 3, 2.6, seed=6),
+        "floor": Noise(0.07, (0.35, 0.35, 0.4), 1.0, 2, 3.0, seed=6),
         "torus 0": Checker(0.17, 1.0, 0.35, "xyz", (0.011, 0.013, 0.007)),
         "torus 2": Noise(0.09, 0.35, 1.0, 3, 3.0, seed=11),
     }
     light = Light(
-        "tube", "linear", np.full(3, 21.0), position=np.array([-2.6, -2.5, 5.2]), end=np.array([-0.6, -3.0, 5.2])
+        "tube", "linear", np.full(3, 30.0), position=np.array([-2.6, -2.5, 5.2]), end=np.array([-0.6, -3.0, 5.2])
     )
     scene = Scene(
         "tori", tuple(surfaces), (light,), _camera((0.4, -6.4, 3.6), (0.4, 0.1, 0.5), 34.0, width, height),

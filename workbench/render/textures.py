@@ -9,7 +9,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from workbench.arrays import as_points
 from workbench.errors import InputError
 
 __all__ = ["Checker", "Noise", "Texture"]
@@ -88,10 +87,11 @@ class Noise:
             raise InputError(f"noise: found size {self.size} and octaves {self.octaves}, expected > 0 and 1 or more")
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        value = _fractal(as_points(points), 1.0 / self.size, self.octaves, self.seed)
-        share = np.clip(0.5 + self.contrast * (value - 0.5), 0.0, 1.0)[:, None]
-        low, high = np.atleast_1d(np.asarray(self.low)), np.atleast_1d(np.asarray(self.high))
-        return low + share * (high - low)
+        low, high = np.broadcast_arrays(np.atleast_1d(self.low), np.atleast_1d(self.high))
+        return _noise(
+            points, 1.0 / self.size, self.octaves, self.seed, self.contrast,
+            np.array(low, dtype=np.float64), np.array(high, dtype=np.float64),
+        )  # fmt: skip
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -104,8 +104,8 @@ def _lattice(x, y, z, seed):
 
 
 @njit(nogil=True, cache=True)
-def _fractal(points, frequency, octaves, seed):
-    found = np.empty(points.shape[0])
+def _noise(points, frequency, octaves, seed, contrast, low, high):
+    found = np.empty((points.shape[0], low.shape[0]))
     for i in range(points.shape[0]):
         total = weight = 0.0
         scale, share = frequency, 1.0
@@ -124,5 +124,7 @@ def _fractal(points, frequency, octaves, seed):
             total += share * value
             weight += share
             scale, share = scale * 2.0, share * 0.5
-        found[i] = total / weight
+        share = min(max(0.5 + contrast * (total / weight - 0.5), 0.0), 1.0)
+        for band in range(low.shape[0]):
+            found[i, band] = low[band] + share * (high[band] - low[band])
     return found

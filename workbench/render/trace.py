@@ -391,13 +391,21 @@ class Tracer:
         self._pane_transmittance = through[panes.polygon_surface]
 
     @property
+    def branching(self) -> int:
+        """Rays that may follow from a hit: 1, or 2 in a scene with transparent surfaces."""
+        return 1 if self._panes is None else 2
+
+    @property
     def light_count(self) -> int:
         """Number of lights."""
         return len(self._lights)
 
     def ray_trees(self, count: int, *, whole_tree: bool = False, normals: bool = False) -> RayTrees:
         """Room to record ``count`` samples: the top of each ray tree, or every node to the depth limit."""
-        nodes = 2 ** (self.options.depth + 1) - 1 if whole_tree else 1
+        nodes = 1
+        if whole_tree:
+            # Without anything transparent the tree is a chain of reflections.
+            nodes = self.options.depth + 1 if self.branching == 1 else 2 ** (self.options.depth + 1) - 1
         return RayTrees.empty(count, nodes, self.light_count, self.bands, normals)
 
     def trace(
@@ -608,7 +616,7 @@ class _Sweep:
         for index, texture in tracer._textures.items():
             rows = np.flatnonzero(found.surface == index)
             if len(rows):
-                reflectance[rows] *= texture(found.points[rows])
+                kernels.scale_rows(rows, texture(found.points.take(rows, axis=0)), reflectance)
         mirrored = kernels.mirror(found.directions, found.shading, found.facing, found.surface, materials.mirrors)
         leaving = radiance if count == len(radiance) else np.empty((count, tracer.bands))
         kernels.sent_unlit(found.surface, lit, reflectance, materials.radiance, tracer._ambient, leaving)
@@ -837,7 +845,7 @@ class _Sweep:
         kernels.next_rays(rows, found.points, found.facing, side, tracer.offset, start)
         keys = kernels.child_keys(wave.keys[found.ray[rows]], branch, 1)
         sample, parent = found.sample[rows], found.node[rows]
-        node = 2 * parent + branch
+        node = tracer.branching * parent + branch
         if tracer.options.bundle > 1:
             exponents = tracer._materials.exponent[found.surface[rows]]
             along = kernels.lobe(along, exponents, found.facing[rows], keys, copies)
