@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from workbench.study.result import StudyResult
 
-__all__ = ["REPRODUCTIONS", "camera_table_1", "woo_corner_samples", "woo_tori"]
+__all__ = ["REPRODUCTIONS", "camera_table_1", "woo_corner_samples", "woo_table_1", "woo_tori"]
 
 
 def woo_tori(quick: bool) -> StudyResult:
@@ -30,6 +30,13 @@ def woo_corner_samples(quick: bool) -> StudyResult:
     return corner_study(width=160, height=120) if quick else corner_study()
 
 
+def woo_table_1(quick: bool) -> StudyResult:
+    """Woo's Table 1: aliased, adaptive and atomic adaptive pictures, seconds and rays saved."""
+    from workbench.study.atomic_table import atomic_study
+
+    return atomic_study(width=120, height=90, repeats=1) if quick else atomic_study()
+
+
 def camera_table_1(quick: bool) -> StudyResult:
     """Table 1 of the hardware-camera paper: shadow rays against cameras, seconds and error."""
     from workbench.study.camera_table import camera_study
@@ -40,6 +47,7 @@ def camera_table_1(quick: bool) -> StudyResult:
 REPRODUCTIONS: dict[str, Callable[[bool], StudyResult]] = {
     "camera-table-1": camera_table_1,
     "woo-corner-samples": woo_corner_samples,
+    "woo-table-1": woo_table_1,
     "woo-tori": woo_tori,
 }
 """By the names of the command line."""

@@ -400,6 +400,11 @@ class Tracer:
         """Number of lights."""
         return len(self._lights)
 
+    @property
+    def triangle_count(self) -> int:
+        """Number of triangles traced."""
+        return len(self._triangles)
+
     def ray_trees(self, count: int, *, whole_tree: bool = False, normals: bool = False) -> RayTrees:
         """Room to record ``count`` samples: the top of each ray tree, or every node to the depth limit."""
         nodes = 1
