@@ -18,7 +18,7 @@ from radiosity.form_factors._sampling import place_on_pieces
 from radiosity.form_factors.analytic import pair_exchange
 from radiosity.patches import PatchMesh
 from workbench.accel.box_tree import BoxTree, boxes_meeting_planes
-from workbench.culling.plane_vertex import CHECK_SLACK, light_pyramid, outside_planes
+from workbench.culling.plane_vertex import light_pyramid, outside_planes
 from workbench.culling.shaft import MAX_SHAFT_PLANES, box_shaft
 from workbench.culling.tally import (
     CHECK,
@@ -138,7 +138,7 @@ def occluder_arrays(geometry: Geometry, tree: BoxTree) -> OccluderArrays:
         tree.first,
         tree.count,
         tree.order,
-        CHECK_SLACK * geometry.size,
+        geometry.slack,
     )
 
 
@@ -263,18 +263,20 @@ def _point_share(
     x, y, z, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start, sender_normal, corners, starts,
     piece_polygon, through, slack, found, count, limit, planes, picked, boxes, sizes, weights, cut, tally,
 ):  # fmt: skip
-    """Form factor from a point to the sender pieces ``t0..t1``; ``NEEDS_RAYS`` if too many remain.
+    """Visible and open form factor from a point to the sender pieces ``t0..t1``.
 
+    The visible one is ``NEEDS_RAYS`` if too many candidates remain.
     ``found[:count]`` are the group's candidates, of which at most ``limit`` may cross the pyramid.
     The arrays come one by one: handing on tuples of arrays costs more than the work done here.
     """
-    total = 0.0
+    total = whole = 0.0
     for s in range(t0, t1):
         s0, s1 = sender_start[s], sender_start[s + 1]
         share = open_share(x, y, z, nx, ny, nz, sender_corners, s0, s1, sender_normal, s, slack)
         if share <= 0.0:
             continue
         tally[CLOSED] += 1
+        whole += share
         used = light_pyramid(x, y, z, nx, ny, nz, sender_corners, s0, s1, sender_normal[s], 2.0 * slack, planes)
         kept = _pick(
             found, count, own, other, piece_polygon, corners, starts, planes, used, slack, limit, picked, tally
@@ -295,12 +297,12 @@ def _point_share(
                 tally[OVERFLOW] += 1
         if pieces < 0:
             tally[COMPLEX] += 1
-            return NEEDS_RAYS
+            return NEEDS_RAYS, whole
         tally[PIECES] += pieces
         if pieces == 0:
             tally[DARK] += 1
         total += min(visible, share)
-    return total
+    return total, whole
 
 
 @njit(nogil=True, cache=True)
@@ -341,18 +343,24 @@ def _cell_integral(
     cell, quad, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start, sender_normal, corners, starts,
     piece_polygon, through, slack, found, count, limit, points, planes, picked, boxes, sizes, weights, cut, tally,
 ):  # fmt: skip
-    """Integral of the point form factor over a cell; ``NEEDS_RAYS`` if a point needs them."""
-    total = 0.0
+    """Integrals of the visible and the open form factor over a cell; least and most visible share.
+
+    The visible integral is ``NEEDS_RAYS`` if a point needs them.
+    """
+    total = whole = 0.0
+    least, most = math.inf, 0.0
     for k in range(_cell_points(cell, quad, points)):
-        share = _point_share(
+        share, clear = _point_share(
             points[k, 0], points[k, 1], points[k, 2], nx, ny, nz, own, other, t0, t1, sender_corners, sender_start,
             sender_normal, corners, starts, piece_polygon, through, slack, found, count, limit, planes, picked, boxes,
             sizes, weights, cut, tally,
         )  # fmt: skip
         if share < 0.0:
-            return NEEDS_RAYS
+            return NEEDS_RAYS, 0.0, 0.0, 0.0
         total += points[k, 3] * share
-    return total
+        whole += points[k, 3] * clear
+        least, most = min(least, share), max(most, share)
+    return total, whole, least, most
 
 
 @njit(nogil=True, cache=True)
@@ -417,28 +425,30 @@ def _element_integral(
     """Integral of the point form factor over an element, halving cells until ``tolerance`` is met.
 
     ``tolerance`` is absolute, on the integral; ``levels`` bounds the halvings.  Each cell is
-    compared with its four quarters.  Returns (integral, error estimate); the integral is
-    ``NEEDS_RAYS`` if some point has too many candidates.
+    compared with its four quarters.  Returns the integrals of the visible and of the open form
+    factor by the same points, and an error estimate of the first, which is ``NEEDS_RAYS`` if some
+    point has too many candidates.
     """
-    total = error = 0.0
+    total = whole = error = 0.0
     parent = cells[79]
     for piece in range(p0, p1):
         a, b = ring_start[piece], ring_start[piece + 1]
         fans = 1 if b - a == 4 else b - a - 2
         for k in range(fans):
             quad = _first_cell(ring_corners, a, b, k, cells[0])
-            value = _cell_integral(
+            value, clear, _, _ = _cell_integral(
                 cells[0], quad, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start, sender_normal, corners,
                 starts, piece_polygon, through, slack, found, count, limit, points, planes, picked, boxes, sizes,
                 weights, cut, tally,
             )  # fmt: skip
             if value < 0.0:
-                return NEEDS_RAYS, 0.0
+                return NEEDS_RAYS, 0.0, 0.0
             if levels == 0:
                 total += value
+                whole += clear
                 continue
-            # Row of state: value, tolerance, level.
-            state[0, 0], state[0, 1], state[0, 2] = value, tolerance / fans, 0.0
+            # Row of state: value, tolerance, level, whether the cell lies beside a contrast.
+            state[0, 0], state[0, 1], state[0, 2], state[0, 3] = value, tolerance / fans, 0.0, 0.0
             top = 0
             while top >= 0:
                 value, allowed, level = state[top, 0], state[top, 1], state[top, 2]
@@ -446,47 +456,55 @@ def _element_integral(
                 for i in range(4):
                     for axis in range(3):
                         parent[i, axis] = cells[top, i, axis]
-                quarters = 0.0
+                quarters = clear = most = 0.0
+                least = math.inf
                 for q in range(4):
                     _child(parent, quad, q, cells[top + q])
-                    part = _cell_integral(
+                    part, part_clear, low, high = _cell_integral(
                         cells[top + q], quad, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start,
                         sender_normal, corners, starts, piece_polygon, through, slack, found, count, limit, points,
                         planes, picked, boxes, sizes, weights, cut, tally,
                     )  # fmt: skip
                     if part < 0.0:
-                        return NEEDS_RAYS, 0.0
+                        return NEEDS_RAYS, 0.0, 0.0
                     state[top + q, 0] = part
                     quarters += part
-                difference = abs(quarters - value)
-                if quarters == 0.0 and value == 0.0:
-                    # Every point dark: a lit sliver along the rim would show at a corner first, for
-                    # the umbra of a convex occluder is convex.
-                    glimpse = 0.0
+                    clear += part_clear
+                    least, most = min(least, low), max(most, high)
+                if state[top, 3] > 0.0 or (value == 0.0 and quarters == 0.0):
+                    # The cell may hide an edge along its rim: it is all dark (the umbra of a convex
+                    # occluder is convex, so a lit sliver shows at a corner), or lies beside a contrast.
                     for c in range(4 if quad else 3):
                         for axis in range(3):
                             middle = 0.25 * (parent[0, axis] + parent[1, axis] + parent[2, axis] + parent[3, axis])
                             if not quad:
                                 middle = (parent[0, axis] + parent[1, axis] + parent[2, axis]) / 3.0
                             points[0, axis] = parent[c, axis] + 1e-6 * (middle - parent[c, axis])
-                        seen = _point_share(
+                        seen, _ = _point_share(
                             points[0, 0], points[0, 1], points[0, 2], nx, ny, nz, own, other, t0, t1, sender_corners,
                             sender_start, sender_normal, corners, starts, piece_polygon, through, slack, found, count,
                             limit, planes, picked, boxes, sizes, weights, cut, tally,
                         )  # fmt: skip
                         if seen < 0.0:
-                            return NEEDS_RAYS, 0.0
-                        glimpse = max(glimpse, seen)
-                    difference = 0.25 * glimpse * _cell_area(parent, quad)
+                            return NEEDS_RAYS, 0.0, 0.0
+                        least, most = min(least, seen), max(most, seen)
+                difference = abs(quarters - value)
+                contrast = most - least > 0.5 * most
+                if contrast:
+                    # A shadow edge lies between these points, and a rule and its quarters can place it
+                    # alike and wrongly: by an eighth of the cell, say.
+                    difference += 0.5 * (most - least) * _cell_area(parent, quad)
                 if difference <= 4.0 * allowed or level + 1.0 >= levels:
                     total += quarters
+                    whole += clear
                     error += 0.25 * difference
                     top -= 1
                 else:
                     for q in range(4):
                         state[top + q, 1], state[top + q, 2] = 0.5 * allowed, level + 1.0
+                        state[top + q, 3] = 1.0 if contrast else 0.0
                     top += 3
-    return total, error
+    return total, whole, error
 
 
 @njit(nogil=True, cache=True)
@@ -895,7 +913,7 @@ def shoot(
             depth = levels
             if open_factor < floor:
                 depth = 0  # too faint to be worth a second look
-            value, doubt = _element_integral(
+            value, whole, doubt = _element_integral(
                 mesh.corners, mesh.piece_start, mesh.element_piece[e], mesh.element_piece[e + 1], mesh.normal[e, 0],
                 mesh.normal[e, 1], mesh.normal[e, 2], mesh.polygon[e], mesh.patch_polygon[patch],
                 mesh.patch_sender[patch], mesh.patch_sender[patch + 1], mesh.sender_corners, mesh.sender_start,
@@ -903,17 +921,19 @@ def shoot(
                 candidates, many, limit, allowed, depth, work.cells, work.state, work.points, work.planes, work.picked,
                 work.boxes, work.sizes, work.weights, work.cut, tally,
             )  # fmt: skip
-            if value < 0.0:
+            if value < 0.0 or whole <= 0.0:
                 factor[e] = open_factor
                 rays[e] = True
-            else:
-                # Rounding or a rule's error may not lift a part above the whole.
-                factor[e] = min(value / area, open_factor)
-                spread[e] = doubt / area
-                if depth == 0:
-                    # One rule of four points and no second look: the doubt of four samples.
-                    share = factor[e] / open_factor
-                    spread[e] = 0.5 * open_factor * math.sqrt(share * (1.0 - share)) + share * open_doubt
+                continue
+            # The visible share scales the open factor, which is known better than by these points.
+            share = value / whole
+            factor[e] = open_factor * share
+            spread[e] = doubt / whole * open_factor + abs(whole / (open_factor * area) - 1.0) * open_factor * min(
+                share, 1.0 - share
+            )
+            if depth == 0:
+                # One rule of four points and no second look: the doubt of four samples.
+                spread[e] += 0.5 * open_factor * math.sqrt(share * max(1.0 - share, 0.0)) + share * open_doubt
 
 
 @njit(nogil=True, cache=True)

@@ -79,7 +79,7 @@ def _check(
     if workers < 1:
         raise OptionError(f"workers: found {workers}, expected 1 or more")
     where = str(scene.path) if scene.path is not None else scene.name
-    if not scene.surfaces:
+    if not any(surface.face_count for surface in scene.surfaces):
         raise InputError(f"{where}: found no surface; add a [[surface]] to the scene")
     if not scene.has_emitter:
         raise InputError(
@@ -202,7 +202,8 @@ def solve(
 
     Notes
     -----
-    Specular reflection and refraction are left to the picture: their share is absorbed here.
+    Specular reflection and refraction are left to the picture: their share is absorbed here.  Panes
+    (transmittance above 0) dim what is cut exactly and block rays; ``record.choices`` says so.
     """
     count = workers if workers is not None else len(os.sched_getaffinity(0))
     _check(scene, method, elements, max_edge, rays, tolerance, count)
@@ -240,6 +241,11 @@ def solve(
     record.choices["form_factor_error"] = f"{error:g}"
     if any(surface.material.specular.any() for surface in scene.surfaces):
         record.choices["specular"] = "mirror reflection is left to pictures; its share is absorbed"
+    if geometry.polygon_transmittance.any():
+        record.choices["transmittance"] = (
+            "panes dim what is cut exactly; where rays decide (long candidate lists, clusters, lights without surface)"
+            " they block"
+        )
     with record.stage("prepare"):
         bundles = ReceiverBundles(geometry, mesh, _settings(error, rays, seed, mesh.patch_count), count)
     try:

@@ -92,6 +92,14 @@ class Geometry:
         return float(np.ptp(self.bounds, axis=0).max()) or 1.0
 
     @cached_property
+    def slack(self) -> float:
+        """Distance by which a polygon must lie outside a plane to be culled. [scene lengths]
+
+        A share of the size, but never less than the coordinates' own rounding far from the origin.
+        """
+        return max(1e-12 * self.size, 16.0 * float(np.finfo(np.float64).eps) * float(np.abs(self.bounds).max()))
+
+    @cached_property
     def piece_bounds(self) -> FloatArray:
         """(p, 2, 3) float: lowest and highest corner of each piece."""
         starts = self.piece_start[:-1]
