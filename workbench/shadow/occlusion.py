@@ -57,15 +57,15 @@ METHODS = ("adaptive", "auto", "camera", "camera-optimised", "exact", "rays", "r
 _UNCULLED = ("adaptive", "rays", "rays+plane-vertex")
 """Methods that ask every point that faces the light."""
 
-TILE = 1024
-"""Points a tile, about."""
+TILE = (96, 1024)
+"""Points a tile, about: a 256th of a plane's, but at least and at most these."""
 MARGIN = 1.3
 """Errors of neighbouring fits partly cancel: measured errors stay below the asked one by this."""
 PILOT_POINTS = 256
 """Points that give a first idea of the mean irradiance."""
 CUT_LIMIT = 12
 """Longest candidate list that ``auto`` and ``shaft`` cut exactly."""
-LEAST_MEAN = 0.02
+LEAST_MEAN = 0.05
 """``auto``: of darker scenes the error is asked relative to this share of the unoccluded irradiance."""
 LIFT = 1e-9
 """Distance by which rays of the instrument begin and end off surfaces, as a share of the scene's size."""
@@ -163,7 +163,7 @@ def _planes_of(points: FloatArray, normals: FloatArray, own: IntArray, size: flo
 
 
 def _tiles(points: FloatArray, normals: FloatArray, own: IntArray, size: float) -> _Tiles:
-    """Group points by plane, then by squares of that plane that hold about :data:`TILE` points."""
+    """Group points by plane, then by squares of that plane that hold about many points."""
     plane = _planes_of(points, normals, own, size)
     count = int(plane.max()) + 1
     first = np.zeros(count, dtype=np.int64)
@@ -181,7 +181,7 @@ def _tiles(points: FloatArray, normals: FloatArray, own: IntArray, size: float) 
             u, v = plane_basis(normals[first[number]])
             here = np.column_stack([points[inside] @ u, points[inside] @ v])
             low, extent = here.min(axis=0), np.ptp(here, axis=0)
-            tiles = max(1, round(len(inside) / TILE))
+            tiles = max(1, round(len(inside) / min(max(len(inside) / 256, TILE[0]), TILE[1])))
             aspect = extent[0] / extent[1] if extent[1] > 0 else math.inf
             across = min(max(round(math.sqrt(tiles * min(aspect, tiles))), 1), tiles)
             counts = np.array([across, max(1, round(tiles / across))])
@@ -282,6 +282,9 @@ def _sides(light: AreaLight | PolygonLight | DiskLight) -> list[list[FloatArray]
     return [short, [np.ascontiguousarray(ring[::-1]) for ring in short]] if both else [short]
 
 
+_LIGHTS = (AreaLight, DirectionalLight, DiskLight, LinearLight, PointLight, PolygonLight, SphereLight)
+
+
 def _power(light: AreaLight | Sender) -> FloatArray:
     """What the light's share is multiplied by: exitance of a surface, intensity of others."""
     power = light.radiance * math.pi if isinstance(light, AreaLight) else light.power
@@ -350,6 +353,9 @@ class Shader:
         chosen = list(lights) if isinstance(lights, Sequence) else [lights]
         if not chosen:
             raise InputError("lights: found none, expected one or more")
+        for light in chosen:
+            if not isinstance(light, _LIGHTS):
+                raise InputError(f"lights: found {type(light).__name__}, expected AreaLight or one of shadow.lights")
         powers = [_power(light) for light in chosen]
         bands = max(len(power) for power in powers)
         if {len(power) for power in powers} - {1, bands}:
@@ -389,8 +395,7 @@ class Shader:
             return self._linear(tiles, light, task)
         if isinstance(light, SphereLight):
             return self._sphere(tiles, light, task)
-        if not isinstance(light, (AreaLight, PolygonLight, DiskLight)):
-            raise InputError(f"light: found {type(light).__name__}, expected an AreaLight or one of shadow.lights")
+        assert isinstance(light, (AreaLight, PolygonLight, DiskLight))
         if isinstance(light, AreaLight):
             polygons = np.asarray([light.polygon_id] if light.polygon_id >= 0 else [], dtype=np.int64)
         else:
@@ -450,6 +455,7 @@ class Shader:
         if method == "exact" and self._through.any():
             raise InputError("method: found 'exact' for a linear light behind panes; use 'rays'")
         if method in ("exact", "shaft", "auto") and not self._through.any():
+            bundle = replace(bundle, lift=4.0 * task.slack)  # exact: rounding only
             pieces = self._pieces_toward(bundle.place, np.stack([light.start, light.end]), task)
             found = visible_linear_irradiance(
                 self.geometry, bundle.place, bundle.normals, light.start, light.end, lambertian=light.lambertian,
@@ -670,9 +676,8 @@ class Shader:
     ) -> None:  # fmt: skip
         """Rays at the points that are left, all of them or as many as a smooth fit needs."""
         n = len(tiles.points)
-        share, spread = np.zeros(n), np.zeros(n)
 
-        def sample(rows: IntArray, count: int) -> FloatArray:
+        def sample(rows: IntArray, count: int) -> tuple[FloatArray, FloatArray]:
             bundle = self._bundle(tiles, rows, count, task)
             if task.method == "adaptive":
                 value, noise = _sampled.adaptive_shares(self.grid, bundle, ring, normal, polygon, task.counters)
@@ -686,29 +691,27 @@ class Shader:
                     seed=task.seed, workers=self.workers,
                 )  # fmt: skip
                 task.counters.add(rays=len(rows) * count)
-            spread[rows] = noise
-            return value
+            return value, noise
 
         if task.method == "auto":
             # The error is asked of the irradiance over all points: what may a share here be off by?
             pilot = waiting[:: max(1, len(waiting) // PILOT_POINTS)]
-            mean = (seen.sum() + float((sample(pilot, 16) * part[pilot]).mean()) * len(waiting)) / n
+            mean = (seen.sum() + float((sample(pilot, 16)[0] * part[pilot]).mean()) * len(waiting)) / n
             mean = max(mean, LEAST_MEAN * float(part.mean()))
             weight = math.sqrt(float((part[waiting] ** 2).sum()) / n)
             allowed = min(max(MARGIN * task.error * mean / weight, 1e-5), 0.25)
             # Rows of the complex points only, tile by tile.
             tile = np.searchsorted(tiles.start, waiting, side="right") - 1
             edges = np.concatenate([[0], np.flatnonzero(np.diff(tile)) + 1, [len(waiting)]])
-            local, fitted = np.zeros(len(waiting)), np.zeros(len(waiting))
+            share, spread = np.zeros(len(waiting)), np.zeros(len(waiting))
             fill_smoothly(
                 tiles.flat[waiting], edges[:-1], edges[1:], lambda rows, to: sample(waiting[rows], _rays_for(to)),
-                local, fitted, error=allowed,
+                share, spread, error=allowed,
             )  # fmt: skip
-            share[waiting], spread[waiting] = local, fitted
         else:
-            share[waiting] = sample(waiting, task.samples)
-        seen[waiting] += share[waiting] * part[waiting]
-        doubt[waiting] += spread[waiting] * part[waiting]
+            share, spread = sample(waiting, task.samples)
+        seen[waiting] += share * part[waiting]
+        doubt[waiting] += spread * part[waiting]
 
 
 def estimate(
@@ -755,7 +758,7 @@ def estimate(
         cuts the disk that each point sees, other methods shoot rays.
     error : float
         ``auto``: wanted error, root mean square over the points, relative to their mean irradiance
-        (or to a fiftieth of the unoccluded one, if that is more).
+        (or to a twentieth of the unoccluded one, if that is more).
     samples : int
         Rays a point and convex piece of a light, or pixels a picture.
     seed : int

@@ -8,7 +8,6 @@ the tile is quartered.  The samples carry their own noise, which the same check 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -20,18 +19,20 @@ __all__ = ["SAMPLE_NOISE", "fill_smoothly"]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-NODES = 24
+NODES = 25
 """Samples a tile."""
 TERMS = 10
 """Coefficients of a cubic in two variables."""
 SAMPLE_NOISE = 1.2
 """Noise that samples may have, in units of the wanted error: the fit takes a third of it away."""
+ALONE_NOISE = 0.72
+"""Noise of points that no fit smooths: no neighbours cancel it, so it must stay below the wanted error."""
 SMALLEST = 48
 """Tiles of at most this many points are sampled at each of them."""
 
 # Nodes spread over [-1, 1]^2 more densely toward the rim, where fits are worst.
 _RIM = np.array([-0.96, -0.6, 0.0, 0.6, 0.96])
-_NODES = np.array([(u, v) for u in _RIM for v in _RIM if u or v])
+_NODES = np.array([(u, v) for u in _RIM for v in _RIM])
 
 
 @njit(nogil=True, cache=True)
@@ -62,7 +63,7 @@ def fill_smoothly(
     flat: FloatArray,
     start: IntArray,
     stop: IntArray,
-    sample: Callable[[IntArray, float], FloatArray],
+    sample: Callable[[IntArray, float], tuple[FloatArray, FloatArray]],
     share: FloatArray,
     doubt: FloatArray,
     *,
@@ -77,7 +78,7 @@ def fill_smoothly(
     start, stop : (t,) int
         Tile ``t`` is rows ``start[t]:stop[t]``.
     sample : callable
-        Shares at the given rows, to a given error.
+        Shares at the given rows, to a given error, and their standard errors.
     share, doubt : (n,) float
         Written: visible share [0..1] and its estimated error.
     error : float
@@ -100,8 +101,7 @@ def fill_smoothly(
         small = (sizes <= SMALLEST) | (low == high).all(axis=1)
         direct = rows[small[tile]]
         if len(direct):
-            share[direct] = sample(direct, error)
-            doubt[direct] = error
+            share[direct], doubt[direct] = sample(direct, ALONE_NOISE * error)
             sampled += len(direct)
         keep = ~small[tile]
         rows, sizes = rows[keep], sizes[~small]
@@ -117,9 +117,9 @@ def fill_smoothly(
         usable = (chosen >= 0).sum(axis=1) >= NODES - 2
         spot = np.where(chosen >= 0, chosen, edges[:-1, None])
         known = chosen >= 0
-        values = np.zeros(chosen.shape)
+        values, noise = np.zeros(chosen.shape), np.zeros(chosen.shape)
         ask = known & usable[:, None]
-        values[ask] = sample(rows[spot[ask]], SAMPLE_NOISE * error)
+        values[ask], noise[ask] = sample(rows[spot[ask]], SAMPLE_NOISE * error)
         sampled += int(ask.sum())
         basis = _terms(place[spot]) * known[..., None]
         q, r = np.linalg.qr(basis)
@@ -130,9 +130,12 @@ def fill_smoothly(
         fit = np.einsum("tkj,tj->tk", q, weights)
         leverage = np.einsum("tkj,tkj->tk", q, q)
         left_out = np.where(known, (values - fit) / np.maximum(1.0 - leverage, 0.02), 0.0)
-        # A left-out sample differs by its own noise too, of which the fit keeps TERMS / NODES.
-        rms = np.sqrt((left_out**2 * (1.0 - leverage)).sum(axis=1) / np.maximum(known.sum(axis=1), 1))
-        rms *= math.sqrt(TERMS / NODES)
+        # A left-out sample differs by its own noise, of which the fit keeps TERMS / NODES, and by misfit, all of
+        # which stays.
+        count = np.maximum(known.sum(axis=1), 1)
+        square = (left_out**2 * (1.0 - leverage)).sum(axis=1) / count
+        variance = (noise**2).sum(axis=1) / count
+        rms = np.sqrt(np.maximum(square - variance * (1.0 - TERMS / NODES), variance * TERMS / NODES))
         good = usable & (rms <= error)
         coefficients = np.linalg.solve(r, weights[..., None])[..., 0]
         done = good[tile]
