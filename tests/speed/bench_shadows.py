@@ -302,7 +302,7 @@ def stages(shader: Shader, points: np.ndarray, light: AreaLight, floor: int, err
     return f"auto at error={error:g}: {parts} s, of it Embree {sum(inside):.2f} s; {counted}"
 
 
-def chart(cases: list[Case], path: Path) -> None:
+def chart(cases: list[Case], side: int, threads: int, path: Path) -> None:
     """Error against seconds, both logarithmic."""
     import matplotlib
 
@@ -321,11 +321,11 @@ def chart(cases: list[Case], path: Path) -> None:
         )  # fmt: skip
     for target in TARGETS:
         axes.axhline(target, color="grey", linestyle=":", linewidth=1)
-        axes.annotate(f"{target:.1%}", (0.005, target), xycoords=("axes fraction", "data"), va="bottom", color="grey")
-    axes.set(xscale="log", yscale="log", xlabel="seconds, two threads", ylabel="RMS error / mean irradiance")
-    axes.set_title("Torus of 20,736 triangles over a floor of 512 x 512 points, quad light")
+        axes.annotate(f"{target:.1%}", (0.95, target), xycoords=("axes fraction", "data"), va="bottom", color="grey")
+    axes.set(xscale="log", yscale="log", xlabel=f"seconds, {threads} threads", ylabel="RMS error / mean irradiance")
+    axes.set_title(f"Torus of 20,736 triangles over a floor of {side} x {side} points, quad light")
     axes.grid(True, which="major", alpha=0.3)
-    axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 0.07))
+    axes.legend(fontsize=8, loc="lower left")
     figure.savefig(path, dpi=110)
 
 
@@ -428,7 +428,7 @@ def main() -> None:
     out.write(office(arguments) + "\n")
     if arguments.output:
         arguments.output.mkdir(parents=True, exist_ok=True)
-        chart(cases, arguments.output / "shadows.png")
+        chart(cases, arguments.grid, arguments.threads, arguments.output / "shadows.png")
         out.write(f"chart: {arguments.output / 'shadows.png'}\n")
 
 
