@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from radiosity.reproduce import REPRODUCTIONS
+from radiosity.shadow_command import shadow
 from workbench.errors import InputError, OptionError, WorkbenchError
 
 if TYPE_CHECKING:
@@ -380,6 +381,9 @@ def reproduce(name: str, directory: Path | None, quick: bool) -> None:
         click.echo(click.wrap_text(f"- {note}", width=110, subsequent_indent="  "))
     for path in files:
         click.echo(str(path))
+
+
+main.add_command(shadow)
 
 
 # ---- view, scenes, doctor ---------------------------------------------------------------------

@@ -1,0 +1,465 @@
+"""The command ``radiosity shadow``: one question to a scene by several methods, and what each cost.
+
+Only ``click`` is imported at the top; everything heavy is imported when the command runs.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from workbench.errors import InputError, OptionError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from workbench.geometry.flat import Geometry
+    from workbench.scene.model import Scene
+    from workbench.shadow.occlusion import OcclusionEstimate
+
+__all__ = ["shadow"]
+
+CONVERGED = 4096
+"""Rays a point of the run that stands in for an exact one."""
+STATES = (("not in shadow", "#f0e442"), ("in shadow", "#3b3b58"), ("complex", "#56b4e9"))
+"""The occlusion states, in their order, with colours that the colour-blind can tell apart."""
+
+
+class _Grid(click.ParamType):
+    """A number of points along two sides, such as 32x24."""
+
+    name = "NxM"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        if isinstance(value, tuple):
+            return value
+        match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", value)
+        sides = (int(match[1]), int(match[2])) if match else (0, 0)
+        if not all(1 <= side <= 4096 for side in sides):
+            self.fail(f"found {value!r}, expected two numbers from 1 to 4096 such as 32x32", param, ctx)
+        return sides
+
+
+@click.command()
+@click.argument("scene")
+@click.option("--grid", type=_Grid(), help="Points on a flat surface.  [default: 32x32]")
+@click.option("--surface", metavar="NAME", help="That surface.  [default: the largest that faces up]")
+@click.option(
+    "--points",
+    "points_path",
+    type=click.Path(path_type=Path),
+    metavar="FILE.csv",
+    help="Points from a file instead, a line each: x,y,z,nx,ny,nz.",
+)
+@click.option("--method", "methods", default="auto", show_default=True, metavar="A,B,...", help="Methods, see below.")
+@click.option("--light", metavar="NAME", help="One light only.  [default: all]")
+@click.option(
+    "--samples",
+    type=click.IntRange(1, 1 << 20),
+    default=64,
+    show_default=True,
+    metavar="K",
+    help="Rays a point and light, or pixels a picture.",
+)
+@click.option(
+    "--error",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.01,
+    show_default=True,
+    metavar="E",
+    help="Relative error that 'auto' is to meet.",
+)
+@click.option("--seed", type=click.IntRange(0, 2**62), default=0, show_default=True, metavar="S", help="Of the rays.")
+@click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Threads.  [default: all cores]")
+@click.option("-o", "--output", "directory", type=click.Path(path_type=Path), metavar="DIR", help="Write files here.")
+@click.option("--json", "json_path", metavar="FILE", help="Write the run's record here; - is standard output.")
+def shadow(
+    scene: str,
+    grid: tuple[int, int] | None,
+    surface: str | None,
+    points_path: Path | None,
+    methods: str,
+    light: str | None,
+    samples: int,
+    error: float,
+    seed: int,
+    workers: int | None,
+    directory: Path | None,
+    json_path: str | None,
+) -> None:
+    """How much of the lights do points of SCENE see, and what does each method do to find out?
+
+    SCENE is a scene file or the name of a built-in scene.  Prints a row a method: rays, intersection
+    tests done and avoided, polygons checked and culled, seconds, the error against exact cuts (root
+    mean square over the points, relative to their mean irradiance) and the error that the method
+    itself states.  DIR gets shadow.csv, shadow.png (irradiance, occlusion states, candidates) and
+    record.json.
+
+    Methods: adaptive, auto, camera, camera-optimised, exact, rays, rays+plane-vertex, shaft.
+    """
+    if points_path is not None and (grid is not None or surface is not None):
+        raise OptionError("--points: found --grid or --surface as well, expected one of them; leave the other out")
+    for path in (directory, Path(json_path).parent if json_path not in (None, "-") else None):
+        _check_folder(path)
+    if json_path not in (None, "-") and Path(str(json_path)).is_dir():
+        raise OptionError(f"--json: found the folder {json_path}, expected a file name")
+    from workbench.record import RunRecord
+
+    record = RunRecord("shadow")
+    with record.stage("read"):
+        import workbench
+
+        loaded = workbench.load(scene)
+    for note in loaded.notes:
+        click.echo(f"note: {note}", err=True)
+    from workbench.shadow.occlusion import METHODS
+    from workbench.study.result import StudyResult, format_table, write_study
+
+    names = [name.strip() for name in methods.split(",")]
+    for name in names:
+        if name not in METHODS:
+            raise OptionError(f"--method: found {name!r}, expected one or more of {', '.join(METHODS)}")
+    with record.stage("prepare"):
+        from workbench.geometry.flat import Geometry
+
+        geometry = Geometry.from_scene(loaded)
+        lights = _chosen_lights(loaded, geometry, light)
+        if points_path is not None:
+            sensors = read_points(points_path)
+        else:
+            sensors = surface_grid(loaded, geometry, surface, grid or (32, 32))
+    rows, found, reference = _run(geometry, lights, sensors, names, samples, error, seed, workers, record)
+    record.settings = {
+        "scene": scene, "surface": surface, "points": str(points_path) if points_path else None,
+        "grid": list(grid) if grid else None, "methods": names, "light": light, "samples": samples, "error": error,
+        "seed": seed, "workers": workers,
+    }  # fmt: skip
+    record.choices["reference"] = reference
+    title = (
+        f"{loaded.name}: {len(sensors.points)} points on {sensors.name}, {len(lights)} light(s), "
+        f"{geometry.polygon_count} polygons; errors against {reference}"
+    )
+    result = StudyResult("shadow", title, rows, [], record, lambda figure: _draw(figure, loaded.name, sensors, found))
+    to_error = json_path == "-"
+    click.echo(f"{title}\n\n{format_table(rows)}", err=to_error)
+    if directory is not None:
+        for path in write_study(result, directory):
+            click.echo(str(path), err=to_error)
+    if json_path is not None:
+        record.results |= {"title": title, "rows": rows}
+        try:
+            record.write(json_path)
+        except OSError as problem:
+            raise InputError(f"{json_path}: cannot be written: {problem.strerror or problem}") from None
+
+
+def _check_folder(path: Path | None) -> None:
+    """Refuse, before the work, a folder that cannot take files."""
+    import os
+
+    if path is None:
+        return
+    while not path.exists() and path != path.parent:
+        path = path.parent
+    if not path.is_dir() or not os.access(path, os.W_OK):
+        raise InputError(f"{path}: found no folder that can be written in, expected one; give another")
+
+
+# ---- lights and points --------------------------------------------------------------------------
+
+
+def _chosen_lights(scene: Scene, geometry: Geometry, name: str | None) -> list[Any]:
+    from workbench.shadow.lights import lights_of_scene
+
+    lights = list(lights_of_scene(scene, geometry))
+    if not lights:
+        raise InputError(f"{scene.name}: found no light, expected a light or a surface with emission")
+    if name is None:
+        return lights
+    # A surface of several faces is as many lights, named surface[0], surface[1]...
+    chosen = [light for light in lights if name in (light.name, light.name.rpartition("[")[0])]
+    if not chosen:
+        known = sorted({light.name for light in lights})
+        raise OptionError(f"--light: found {name!r}, expected one of {', '.join(known[:8])}{' ...' * (len(known) > 8)}")
+    return chosen
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Points to be shaded, and where they stand in a picture.
+
+    ``cells`` (n,) numbers the points inside a grid of ``shape`` (rows, columns) over ``extent``
+    (left, right, bottom, top); ``None`` for points that form no grid.
+    """
+
+    name: str
+    points: NDArray
+    normals: NDArray
+    own: NDArray
+    flat: NDArray
+    labels: tuple[str, str]
+    shape: tuple[int, int] | None = None
+    cells: NDArray | None = None
+    extent: tuple[float, float, float, float] | None = None
+
+
+def read_points(path: Path) -> Sensors:
+    """Points and normals from a file of six numbers a line; a first line of names is skipped.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a line has other than six finite numbers.
+    """
+    import numpy as np
+
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as problem:
+        reason = getattr(problem, "strerror", None) or "not a text file"
+        raise InputError(f"{path}: cannot be read: {reason}; expected lines of x,y,z,nx,ny,nz") from None
+    rows: list[list[float]] = []
+    for number, cells in enumerate(csv.reader(text.splitlines()), 1):
+        if not cells or (number == 1 and re.fullmatch(r"\s*[A-Za-z_]\w*\s*", cells[0])):
+            continue
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError:
+            row = []
+        if len(row) != 6 or not all(map(math.isfinite, row)):
+            raise InputError(f"{path}: line {number}: found {','.join(cells)!r}, expected six numbers x,y,z,nx,ny,nz")
+        if not any(row[3:]):
+            raise InputError(f"{path}: line {number}: found a normal of length zero, expected a direction")
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path}: found no points, expected lines of x,y,z,nx,ny,nz")
+    table = np.asarray(rows)
+    spread = np.ptp(table[:, :3], axis=0)
+    first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
+    return Sensors(
+        path.name, table[:, :3], table[:, 3:], np.full(len(table), -1), table[:, [first, second]],
+        ("xyz"[first], "xyz"[second]),
+    )  # fmt: skip
+
+
+def surface_grid(scene: Scene, geometry: Geometry, name: str | None, shape: tuple[int, int]) -> Sensors:
+    """Points in the middle of the cells of a grid over a flat surface, as far as they lie on it.
+
+    Without a name: the surface with the largest area that faces up, along the coordinate axis
+    nearest to the camera's up, or z.
+
+    Raises
+    ------
+    InputError
+        If there is no such surface, it is not flat, or no point falls on it.
+    """
+    import numpy as np
+
+    from workbench.geometry.polygons import plane_basis
+
+    up = np.array([0.0, 0.0, 1.0])
+    if scene.camera is not None:
+        axis = int(np.argmax(np.abs(scene.camera.up)))
+        up = np.eye(3)[axis] * np.sign(scene.camera.up[axis])
+    area, normal = geometry.polygon_area, geometry.polygon_normal
+    if name is None:
+        twice = np.array([m.two_sided for m in geometry.surface_material], dtype=bool)[geometry.polygon_surface]
+        dark = np.array([not m.emission.any() for m in geometry.surface_material])[geometry.polygon_surface]
+        rise = normal @ up
+        facing = dark & ((rise > 0.9) | (twice & (rise < -0.9)))
+        if not facing.any():
+            raise InputError(f"{scene.name}: found no surface that faces up; give --surface NAME or --points FILE.csv")
+        sums = np.bincount(geometry.polygon_surface[facing], area[facing], minlength=len(geometry.surface_name))
+        chosen = int(np.argmax(sums))
+        mine = np.flatnonzero(facing & (geometry.polygon_surface == chosen))
+    else:
+        if name not in geometry.surface_name:
+            known = sorted(set(geometry.surface_name))
+            more = " ..." if len(known) > 8 else ""
+            raise OptionError(f"--surface: found {name!r}, expected one of {', '.join(known[:8])}{more}")
+        chosen = geometry.surface_name.index(name)
+        mine = np.flatnonzero(geometry.polygon_surface == chosen)
+        if not len(mine):
+            raise InputError(f"--surface: {name!r} has no polygons; give another")
+    # The flat part with the largest area: polygons of the plane of one of them.
+    lead_piece = geometry.polygon_piece_start[mine]
+    anchor = geometry.corners[geometry.piece_start[lead_piece]]
+    best: Any = mine[:0]
+    for lead in mine[np.argsort(-area[mine], kind="stable")[:16]]:
+        origin = geometry.corners[geometry.piece_start[geometry.polygon_piece_start[lead]]]
+        level = (normal[mine] @ normal[lead] > 1 - 1e-9) & (
+            np.abs((anchor - origin) @ normal[lead]) <= 1e-7 * geometry.size
+        )
+        if area[mine[level]].sum() > area[best].sum():
+            best = mine[level]
+    if area[best].sum() < 0.25 * area[mine].sum() and name is not None and len(mine) > 6:
+        raise InputError(f"--surface: {name!r} is not flat; give its points with --points FILE.csv")
+    front = normal[best[0]]
+    facing_up = front if name is not None or front @ up > 0 else -front
+    axes = [np.eye(3)[k] for k in range(3) if abs(facing_up[k]) < 1e-6]
+    u, v = (axes[0], axes[1]) if len(axes) == 2 else plane_basis(facing_up)
+    pieces = [k for polygon in best for k in range(*geometry.polygon_piece_start[[polygon, polygon + 1]])]
+    flat = [np.column_stack([geometry.piece(k) @ u, geometry.piece(k) @ v]) for k in pieces]
+    low, high = np.concatenate(flat).min(axis=0), np.concatenate(flat).max(axis=0)
+    columns, rows = shape
+    across = low[0] + (np.arange(columns) + 0.5) / columns * (high[0] - low[0])
+    along = low[1] + (np.arange(rows) + 0.5) / rows * (high[1] - low[1])
+    place = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
+    own = np.full(len(place), -1)
+    for k, ring in zip(pieces, flat, strict=True):
+        edge = np.roll(ring, -1, axis=0) - ring
+        gap = place[:, None] - ring
+        turn = edge[:, 0] * gap[..., 1] - edge[:, 1] * gap[..., 0]
+        inside = (turn >= 0).all(axis=1) | (turn <= 0).all(axis=1)
+        own[inside & (own < 0)] = geometry.piece_polygon[k]
+    cells = np.flatnonzero(own >= 0)
+    if not len(cells):
+        raise InputError(f"--grid: found no point of {columns}x{rows} on {geometry.surface_name[chosen]!r}; ask more")
+    depth = float(geometry.corners[geometry.piece_start[pieces[0]]] @ facing_up)
+    points = place[cells, :1] * u + place[cells, 1:] * v + depth * facing_up
+    labels = tuple("xyz"[int(np.argmax(w))] if w.max() == 1.0 else letter for w, letter in ((u, "u"), (v, "v")))
+    return Sensors(
+        f"{geometry.surface_name[chosen]!r}", points, np.repeat(facing_up[None], len(points), axis=0), own[cells],
+        place[cells], (labels[0], labels[1]), (rows, columns), cells,
+        (float(low[0]), float(high[0]), float(low[1]), float(high[1])),
+    )  # fmt: skip
+
+
+# ---- the runs and their table -------------------------------------------------------------------
+
+
+def _run(
+    geometry: Geometry, lights: list[Any], sensors: Sensors, methods: list[str], samples: int, error: float, seed: int,
+    workers: int | None, record: Any,
+) -> tuple[list[dict[str, Any]], dict[str, OcclusionEstimate], str]:  # fmt: skip
+    """Rows of the table, the estimates by method, and the name of the reference."""
+    import numpy as np
+
+    from workbench.shadow.occlusion import Shader
+
+    shader = Shader(geometry, workers)
+
+    def ask(method: str, count: int, several: slice = slice(None), seed: int = seed) -> OcclusionEstimate:
+        return shader.estimate(
+            sensors.points[several], sensors.normals[several], lights, method, error=error, samples=count, seed=seed,
+            own_polygon=sensors.own[several],
+        )  # fmt: skip
+
+    found: dict[str, OcclusionEstimate] = {}
+    for method in dict.fromkeys(methods):
+        with record.stage("load kernels"):  # and compile them on a first run: no part of a method's seconds
+            ask(method, samples, slice(0, 2))
+        with record.stage(method):
+            found[method] = ask(method, samples)
+    from workbench.shadow.lights import LinearLight
+
+    lines = any(isinstance(light, LinearLight) for light in lights)
+    if lines and geometry.polygon_transmittance.any():
+        name, method, count = f"{CONVERGED} rays", "rays", CONVERGED
+    else:
+        name, method, count = "exact cuts", "exact", samples
+    if method == "exact" and "exact" in found:
+        reference = found["exact"]
+    else:
+        with record.stage("reference"):
+            reference = ask(method, count, seed=seed + 1)
+    found["reference"] = reference
+    mean = float(reference.irradiance.mean())
+    rows: list[dict[str, Any]] = []
+    for method in dict.fromkeys(methods):
+        estimate = found[method]
+        counted = estimate.counters
+        record.counters.merge(counted)
+        traced = counted["voxels_stepped"] > 0 or counted["polygon_tests"] > 0
+        gap = estimate.irradiance - reference.irradiance
+        rows.append(
+            {
+                "method": method,
+                "rays": counted["rays"],
+                "tests": counted["polygon_tests"] if traced else None,
+                "avoided": counted["tests_avoided"] if traced else None,
+                "checks": counted["plane_vertex_checks"] + counted["shaft_tests"],
+                "culled": counted["plane_vertex_culls"] + counted["shaft_culls"],
+                "hit_rate": counted["rays_hit"] / counted["rays"] if traced and counted["rays"] else None,
+                "seconds": record.seconds[method],
+                "error": float(np.sqrt((gap**2).mean())) / mean if mean > 0 and estimate is not reference else None,
+                "stated_error": float(np.sqrt((estimate.standard_error**2).mean())) / mean if mean > 0 else None,
+            }
+        )
+    record.errors = {f"{row['method']}: rms error / mean irradiance": row["error"] for row in rows}
+    record.results["mean_irradiance_W_m2"] = reference.irradiance.mean(axis=0).tolist()
+    return rows, found, name
+
+
+# ---- the figure ---------------------------------------------------------------------------------
+
+
+def _draw(figure: Figure, name: str, sensors: Sensors, found: dict[str, OcclusionEstimate]) -> None:
+    """Irradiance, states and candidates of the first method, side by side."""
+    import numpy as np
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
+    method, first = next(iter(found.items()))
+    listing = next((m for m, estimate in found.items() if (estimate.candidates >= 0).any()), None)
+    # A light that a point does not face says nothing of its state; of several lights the worst counts.
+    state = np.ma.masked_array(first.state.astype(float), mask=first.open_share <= 0.0)
+    lit, dark = (state == 0).all(axis=1), (state == 1).all(axis=1)
+    shown = np.where(lit.filled(False), 0, np.where(dark.filled(True), 1, 2))
+    spread = np.ptp(sensors.flat, axis=0)
+    aspect = float(min(max(spread[1] / spread[0] if spread[0] > 0 else 1.0, 0.2), 1.5))  # height over width
+    wide = aspect < 0.4
+    figure.set_size_inches((8.0, 3 * (5.5 * aspect + 1.4)) if wide else (14.0, 3.6 * aspect + 1.9))
+    left, middle, right = figure.subplots(3, 1) if wide else figure.subplots(1, 3)
+    figure.suptitle(f"{name}: {len(sensors.points)} points on {sensors.name}")
+
+    picture = _show(left, sensors, first.irradiance.mean(axis=1), cmap="inferno", vmin=0.0)
+    figure.colorbar(picture, ax=left, label="irradiance, mean of the bands [W m$^{-2}$]")
+    left.set_title(f"Irradiance ({method})")
+    colours = ListedColormap([colour for _, colour in STATES])
+    _show(middle, sensors, shown, cmap=colours, vmin=-0.5, vmax=2.5)
+    shares = [float((shown == k).mean()) for k in range(3)]
+    middle.legend(
+        handles=[
+            Patch(facecolor=colour, edgecolor="black", label=f"{label}, {share:.0%}")
+            for (label, colour), share in zip(STATES, shares, strict=True)
+        ],
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.55 / (3.6 * aspect)),
+        ncols=3,
+        fontsize="small",
+        frameon=False,
+    )
+    middle.set_title(f"Occlusion state ({method})")
+    if listing is not None:
+        counts = np.where(found[listing].candidates > 0, found[listing].candidates, 0).sum(axis=1)
+        label = "polygons left by the culls, all lights"
+    else:
+        counts = np.full(len(sensors.points), first.counters["rays"] / len(sensors.points))
+        label = "rays a point"
+    picture = _show(right, sensors, counts, cmap="viridis", vmin=0.0)
+    figure.colorbar(picture, ax=right, label=label)
+    right.set_title(f"Candidates ({listing})" if listing is not None else "Rays")
+
+
+def _show(axes: Any, sensors: Sensors, values: NDArray, **style: Any) -> Any:
+    """A map of one value a point."""
+    import numpy as np
+
+    axes.set_xlabel(f"{sensors.labels[0]} [scene lengths]")
+    axes.set_ylabel(f"{sensors.labels[1]} [scene lengths]")
+    axes.set_aspect("equal")
+    if sensors.shape is None or sensors.cells is None:
+        return axes.scatter(*sensors.flat.T, c=values, s=24, edgecolors="grey", linewidths=0.3, **style)
+    cells = np.full(sensors.shape[0] * sensors.shape[1], np.nan)
+    cells[sensors.cells] = values
+    return axes.imshow(
+        cells.reshape(sensors.shape), origin="lower", extent=sensors.extent, interpolation="nearest", **style
+    )
