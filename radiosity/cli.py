@@ -386,6 +386,148 @@ def reproduce(name: str, directory: Path | None, quick: bool) -> None:
 main.add_command(shadow)
 
 
+# ---- render -----------------------------------------------------------------------------------
+
+
+@main.command()
+@click.argument("scene")
+@click.option("-o", "--output", "path", required=True, type=click.Path(path_type=Path), metavar="FILE.png")
+@click.option(
+    "--direct-only", is_flag=True, required=True, help="Lights, shadows, mirrors and glass; nothing between walls."
+)
+@click.option(
+    "--sampling",
+    type=click.Choice(["aliased", "adaptive", "atomic"]),
+    default="atomic",
+    show_default=True,
+    help="One ray a pixel, adaptive sampling, or atomic adaptive sampling.",
+)
+@click.option(
+    "--atomic",
+    "components",
+    default="shadows,cast,reflection,refraction",
+    show_default=True,
+    metavar="LIST",
+    help="What atomic adaptive sampling may assume.",
+)
+@click.option("--whole-tree", is_flag=True, help="Assume down the whole ray tree, not at its top only.")
+@click.option(
+    "--threshold",
+    type=click.FloatRange(min=-1, max=1),
+    callback=_finite,
+    default=0.06,
+    show_default=True,
+    metavar="T",
+    help="Cut pixels whose corners differ by more than this share of white.",
+)
+@click.option("--level", type=click.IntRange(1, 8), default=3, show_default=True, help="Of subdivision; 3: 25 samples.")
+@click.option("--depth", type=click.IntRange(0, 16), default=3, show_default=True, help="Reflections in a row.")
+@click.option(
+    "--light-samples",
+    type=click.IntRange(1, 4096),
+    default=16,
+    show_default=True,
+    metavar="K",
+    help="Shadow rays to a linear or area light.",
+)
+@click.option(
+    "--bundle", type=click.IntRange(1, 4096), default=1, show_default=True, help="Rays of a fuzzy reflection."
+)
+@click.option(
+    "--falloff/--no-falloff", default=None, help="Of point lights, by distance squared.  [default: no for .nff files]"
+)
+@click.option(
+    "--white",
+    type=click.FloatRange(min=0, min_open=True),
+    callback=_finite,
+    metavar="L",
+    help="Radiance shown as white.  [default: found by a coarse look]",
+)
+@click.option("--width", type=click.IntRange(1, 16384), metavar="PIXELS", help="[default: the camera's]")
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Threads.  [default: all cores]")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of fuzzy rays.")
+@click.option("--json", "json_path", metavar="FILE", help="Write the run's record here; - is standard output.")
+def render(
+    scene: str,
+    path: Path,
+    direct_only: bool,
+    sampling: str,
+    components: str,
+    whole_tree: bool,
+    threshold: float,
+    level: int,
+    depth: int,
+    light_samples: int,
+    bundle: int,
+    falloff: bool | None,
+    white: float | None,
+    width: int | None,
+    workers: int | None,
+    seed: int,
+    json_path: str | None,
+) -> None:
+    """Draw SCENE through its camera into a PNG or TIFF file, without a solve.
+
+    SCENE is a scene file (TOML, NFF, OBJ, ...) or the name of a built-in scene.
+    """
+    import workbench
+    from workbench.render.atomic import AtomicOptions
+    from workbench.render.direct import render_direct
+    from workbench.render.image import check_picture_path, write_picture
+    from workbench.render.trace import TraceOptions
+
+    check_picture_path(path)
+    if json_path not in (None, "-") and not Path(str(json_path)).parent.is_dir():
+        raise InputError(f"{json_path}: found no such folder, expected one; give another --json FILE")
+    atomic = AtomicOptions(tuple(name for name in components.split(",") if name), whole_tree=whole_tree)
+    start = time.perf_counter()
+    loaded = workbench.load(scene)
+    seconds_reading = time.perf_counter() - start
+    for note in loaded.notes:
+        click.echo(f"note: {note}", err=True)
+    nff = loaded.path is not None and loaded.path.suffix.lower() == ".nff"
+    options = TraceOptions(
+        depth=depth,
+        light_samples=light_samples,
+        bundle=bundle,
+        falloff=not nff if falloff is None else falloff,
+        see_backs=not nff,
+        seed=seed,
+    )
+    drawn = render_direct(
+        loaded,
+        sampling=sampling,
+        options=options,
+        atomic=atomic,
+        threshold=threshold,
+        level=level,
+        white=white,
+        width=width,
+        workers=workers or os.cpu_count() or 1,
+    )
+    record = drawn.record
+    record.seconds = {"read scene": seconds_reading} | record.seconds
+    record.settings |= {"depth": depth, "light_samples": light_samples, "bundle": bundle, "seed": seed}
+    record.settings |= {"falloff": options.falloff, "atomic": components, "whole_tree": whole_tree, "scene": scene}
+    write_picture(path, drawn.pixels)
+    if json_path is not None:
+        record.write(json_path)
+    counts = record.counters
+    lines = [
+        f"{loaded.name}: {drawn.pixels.shape[1]} x {drawn.pixels.shape[0]}, "
+        f"{record.results['samples_per_pixel']:.3g} samples a pixel, {counts['rays']:,} rays "
+        f"({counts['cast_rays']:,} cast, {counts['shadow_rays']:,} shadow, {counts['reflection_rays']:,} reflected, "
+        f"{counts['refraction_rays']:,} refracted)"
+    ]
+    if sampling == "atomic":
+        lines.append(
+            f"saved: {counts['cast_rays_saved']:,} cast, {counts['shadow_rays_saved']:,} shadow, "
+            f"{counts['reflection_rays_saved']:,} reflected, {counts['refraction_rays_saved']:,} refracted"
+        )
+    lines.append("seconds: " + "; ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()))
+    click.echo("\n".join([*lines, str(path)]), err=json_path == "-")
+
+
 # ---- view, scenes, doctor ---------------------------------------------------------------------
 
 

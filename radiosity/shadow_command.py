@@ -402,7 +402,7 @@ def _run(
 
 
 def _draw(figure: Figure, name: str, sensors: Sensors, found: dict[str, OcclusionEstimate]) -> None:
-    """Irradiance, states and candidates of the first method, side by side."""
+    """Irradiance of the first method, states and candidates of the first that lists them, side by side."""
     import numpy as np
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
@@ -410,7 +410,8 @@ def _draw(figure: Figure, name: str, sensors: Sensors, found: dict[str, Occlusio
     method, first = next(iter(found.items()))
     listing = next((m for m, estimate in found.items() if (estimate.candidates >= 0).any()), None)
     # A light that a point does not face says nothing of its state; of several lights the worst counts.
-    state = np.ma.masked_array(first.state.astype(float), mask=first.open_share <= 0.0)
+    judge = listing if listing is not None else method
+    state = np.ma.masked_array(found[judge].state.astype(float), mask=found[judge].open_share <= 0.0)
     lit, dark = (state == 0).all(axis=1), (state == 1).all(axis=1)
     shown = np.where(lit.filled(False), 0, np.where(dark.filled(True), 1, 2))
     spread = np.ptp(sensors.flat, axis=0)
@@ -421,7 +422,7 @@ def _draw(figure: Figure, name: str, sensors: Sensors, found: dict[str, Occlusio
     figure.suptitle(f"{name}: {len(sensors.points)} points on {sensors.name}")
 
     picture = _show(left, sensors, first.irradiance.mean(axis=1), cmap="inferno", vmin=0.0)
-    figure.colorbar(picture, ax=left, label="irradiance, mean of the bands [W m$^{-2}$]")
+    figure.colorbar(picture, ax=left, shrink=0.8, label="irradiance, mean of the bands [W m$^{-2}$]")
     left.set_title(f"Irradiance ({method})")
     colours = ListedColormap([colour for _, colour in STATES])
     _show(middle, sensors, shown, cmap=colours, vmin=-0.5, vmax=2.5)
@@ -437,7 +438,7 @@ def _draw(figure: Figure, name: str, sensors: Sensors, found: dict[str, Occlusio
         fontsize="small",
         frameon=False,
     )
-    middle.set_title(f"Occlusion state ({method})")
+    middle.set_title(f"Occlusion state ({judge})")
     if listing is not None:
         counts = np.where(found[listing].candidates > 0, found[listing].candidates, 0).sum(axis=1)
         label = "polygons left by the culls, all lights"
@@ -445,7 +446,7 @@ def _draw(figure: Figure, name: str, sensors: Sensors, found: dict[str, Occlusio
         counts = np.full(len(sensors.points), first.counters["rays"] / len(sensors.points))
         label = "rays a point"
     picture = _show(right, sensors, counts, cmap="viridis", vmin=0.0)
-    figure.colorbar(picture, ax=right, label=label)
+    figure.colorbar(picture, ax=right, shrink=0.8, label=label)
     right.set_title(f"Candidates ({listing})" if listing is not None else "Rays")
 
 

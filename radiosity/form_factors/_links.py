@@ -225,7 +225,7 @@ def workspace(max_corners: int) -> Workspace:
         pair=np.empty((4, room, 3)),
         cells=np.empty((80, 4, 3)),
         points=np.empty((4, 4)),
-        state=np.empty((80, 4)),
+        state=np.empty((80, 5)),
     )
 
 
@@ -426,32 +426,36 @@ def _element_integral(
 
     ``tolerance`` is absolute, on the integral; ``levels`` bounds the halvings.  Each cell is
     compared with its four quarters.  Returns the integrals of the visible and of the open form
-    factor by the same points, and an error estimate of the first, which is ``NEEDS_RAYS`` if some
-    point has too many candidates.
+    factor by the same points, the visible share where the open one was found worst (a mean over the
+    cells, weighted by what quartering changed of it), and an error estimate of the first, which is
+    ``NEEDS_RAYS`` if some point has too many candidates.
     """
-    total = whole = error = 0.0
+    total = whole = error = worst = worst_seen = 0.0
     parent = cells[79]
     for piece in range(p0, p1):
         a, b = ring_start[piece], ring_start[piece + 1]
         fans = 1 if b - a == 4 else b - a - 2
         for k in range(fans):
             quad = _first_cell(ring_corners, a, b, k, cells[0])
-            value, clear, _, _ = _cell_integral(
+            value, open_value, _, _ = _cell_integral(
                 cells[0], quad, nx, ny, nz, own, other, t0, t1, sender_corners, sender_start, sender_normal, corners,
                 starts, piece_polygon, through, slack, found, count, limit, points, planes, picked, boxes, sizes,
                 weights, cut, tally,
             )  # fmt: skip
             if value < 0.0:
-                return NEEDS_RAYS, 0.0, 0.0
+                return NEEDS_RAYS, 0.0, 0.0, 0.0
             if levels == 0:
                 total += value
-                whole += clear
+                whole += open_value
                 continue
             # Row of state: value, tolerance, level, whether the cell lies beside a contrast.
+            # Last, its open integral.
             state[0, 0], state[0, 1], state[0, 2], state[0, 3] = value, tolerance / fans, 0.0, 0.0
+            state[0, 4] = open_value
             top = 0
             while top >= 0:
                 value, allowed, level = state[top, 0], state[top, 1], state[top, 2]
+                beside, open_value = state[top, 3] > 0.0, state[top, 4]
                 # The cell's own row becomes its last quarter, so quarters are made from a copy.
                 for i in range(4):
                     for axis in range(3):
@@ -466,12 +470,12 @@ def _element_integral(
                         planes, picked, boxes, sizes, weights, cut, tally,
                     )  # fmt: skip
                     if part < 0.0:
-                        return NEEDS_RAYS, 0.0, 0.0
-                    state[top + q, 0] = part
+                        return NEEDS_RAYS, 0.0, 0.0, 0.0
+                    state[top + q, 0], state[top + q, 4] = part, part_clear
                     quarters += part
                     clear += part_clear
                     least, most = min(least, low), max(most, high)
-                if state[top, 3] > 0.0 or (value == 0.0 and quarters == 0.0):
+                if beside or (value == 0.0 and quarters == 0.0):
                     # The cell may hide an edge along its rim: it is all dark (the umbra of a convex
                     # occluder is convex, so a lit sliver shows at a corner), or lies beside a contrast.
                     for c in range(4 if quad else 3):
@@ -486,7 +490,7 @@ def _element_integral(
                             limit, planes, picked, boxes, sizes, weights, cut, tally,
                         )  # fmt: skip
                         if seen < 0.0:
-                            return NEEDS_RAYS, 0.0, 0.0
+                            return NEEDS_RAYS, 0.0, 0.0, 0.0
                         least, most = min(least, seen), max(most, seen)
                 difference = abs(quarters - value)
                 contrast = most - least > 0.5 * most
@@ -497,6 +501,10 @@ def _element_integral(
                 if difference <= 4.0 * allowed or level + 1.0 >= levels:
                     total += quarters
                     whole += clear
+                    if clear > 0.0:
+                        change = abs(clear - open_value)
+                        worst += change
+                        worst_seen += change * (quarters / clear)
                     error += 0.25 * difference
                     top -= 1
                 else:
@@ -504,7 +512,8 @@ def _element_integral(
                         state[top + q, 1], state[top + q, 2] = 0.5 * allowed, level + 1.0
                         state[top + q, 3] = 1.0 if contrast else 0.0
                     top += 3
-    return total, whole, error
+    share = worst_seen / worst if worst > 0.0 else (total / whole if whole > 0.0 else 0.0)
+    return total, whole, share, error
 
 
 @njit(nogil=True, cache=True)
@@ -913,7 +922,7 @@ def shoot(
             depth = levels
             if open_factor < floor:
                 depth = 0  # too faint to be worth a second look
-            value, whole, doubt = _element_integral(
+            value, whole, local, doubt = _element_integral(
                 mesh.corners, mesh.piece_start, mesh.element_piece[e], mesh.element_piece[e + 1], mesh.normal[e, 0],
                 mesh.normal[e, 1], mesh.normal[e, 2], mesh.polygon[e], mesh.patch_polygon[patch],
                 mesh.patch_sender[patch], mesh.patch_sender[patch + 1], mesh.sender_corners, mesh.sender_start,
@@ -925,12 +934,12 @@ def shoot(
                 factor[e] = open_factor
                 rays[e] = True
                 continue
-            # The visible share scales the open factor, which is known better than by these points.
-            share = value / whole
+            # The open factor is known better than by these points.  What they miss of it (along an edge
+            # that both polygons touch, say) is as visible as the cells where they miss most.
+            missed = open_factor * area - whole
+            share = min(max((value + missed * local) / (open_factor * area), 0.0), 1.0)
             factor[e] = open_factor * share
-            spread[e] = doubt / whole * open_factor + abs(whole / (open_factor * area) - 1.0) * open_factor * min(
-                share, 1.0 - share
-            )
+            spread[e] = doubt / area + 0.25 * abs(missed) / area * (1.0 - abs(2.0 * local - 1.0))
             if depth == 0:
                 # One rule of four points and no second look: the doubt of four samples.
                 spread[e] += 0.5 * open_factor * math.sqrt(share * max(1.0 - share, 0.0)) + share * open_doubt

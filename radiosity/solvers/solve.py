@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 from typing import Any
@@ -138,10 +139,11 @@ def _resumed(scene: Scene, mesh: PatchMesh, previous: Solution, record: RunRecor
     return Solution(
         scene=scene,
         mesh=mesh,
-        radiosity=previous.radiosity,
-        irradiance=previous.irradiance,
-        unshot=previous.unshot,
-        book=previous.book,
+        # Copies: the earlier solution stays what it was.
+        radiosity=previous.radiosity.copy(),
+        irradiance=previous.irradiance.copy(),
+        unshot=previous.unshot.copy(),
+        book=copy.deepcopy(previous.book),
         record=record,
         direct_irradiance=previous.direct_irradiance,
     )
@@ -234,7 +236,7 @@ def solve(
             cluster = method != "direct"
             mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=cluster)
         n = mesh.element_count
-        _forecast(scene, n, None, method)
+    _forecast(scene, n, None, method)
     error = form_factor_error if form_factor_error is not None else _form_factor_error(n, method)
     if not 0 < error < 1:
         raise OptionError(f"form_factor_error: found {error}, expected a number between 0 and 1")

@@ -176,7 +176,7 @@ def _l_room(emitter: int | None = None) -> Scene:
 
 def test_l_room_matrix():
     wanted = np.array(truth("occ/L-room/matrix")["value"])
-    columns, _, bundles = all_columns(_l_room(), tight(3e-7))
+    columns, _, bundles = all_columns(_l_room(), tight(1e-7, levels=20))
     found, stated = columns.factor.T, columns.spread.T
     assert bundles.counters["rays"] == 0
     assert np.abs(found - wanted).max() < 5e-6
