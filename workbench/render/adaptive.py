@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -131,6 +131,7 @@ def adaptive(
     level: int = 3,
     atomic: AtomicOptions | None = None,
     shared_boundary: bool = False,
+    white: float = 1.0,
     rows: int = 32,
 ) -> Picture:
     """Adaptive sampling, and with ``atomic`` atomic adaptive sampling.
@@ -141,8 +142,8 @@ def adaptive(
     camera : PinholeRays, optional
         The scene's own unless given.
     threshold : float
-        Cut a quadrant where a band of its corners' radiances, each pegged at 1, differs by more;
-        below 0 everything is cut.  Error does not fall below what the threshold lets pass.
+        Cut a quadrant where a band of its corners' radiances, each pegged at white, differs by more
+        than this share of white; below 0 everything is cut.  Error does not fall below what the threshold lets pass.
     level : int
         1 samples corners only; level ``n`` allows (2^(n-1) + 1)^2 samples a pixel.
     atomic : AtomicOptions, optional
@@ -151,6 +152,8 @@ def adaptive(
         Woo's additional criterion: also cut a pixel whose corners agree, where a neighbour's
         samples on the shared boundary differ from them by more than the threshold.  Samples of the
         band above count, and those of the same band; so the height of the band has a small say.
+    white : float
+        Radiance shown as white; the thresholds, ``atomic.similar`` too, are shares of it.
     rows : int
         Rows of pixels a band.
 
@@ -165,24 +168,28 @@ def adaptive(
         raise OptionError(f"level: found {level}, expected 1 to 8")
     if rows < 1:
         raise OptionError(f"rows: found {rows}, expected 1 or more")
+    if not 0.0 < white < math.inf:
+        raise OptionError(f"white: found {white}, expected a radiance greater than 0")
+    if atomic is not None:
+        atomic = replace(atomic, similar=atomic.similar * white)
     start = time.perf_counter()
     rays = _camera(tracer, camera)
-    band = _Bands(tracer, rays, threshold, 2 ** (level - 1), atomic, shared_boundary)
+    band = _Bands(tracer, rays, threshold * white, white, 2 ** (level - 1), atomic, shared_boundary)
     for first in range(0, rays.height, rows):
         band.sample(first, min(first + rows, rays.height))
     return Picture(band.radiance, band.samples, band.saved, band.tally, band.traced, time.perf_counter() - start)
 
 
 @njit(nogil=True, cache=True)
-def _corners_differ(colour, place, size, columns, threshold):
-    # Squares whose corners' colours, pegged at 1, differ by more than the threshold.
+def _corners_differ(colour, place, size, columns, threshold, white):
+    # Squares whose corners' colours, pegged at white, differ by more than the threshold.
     uneven = np.zeros(place.shape[0], dtype=np.bool_)
     down = size * columns
     for i in range(place.shape[0]):
         p = place[i]
         for band in range(colour.shape[1]):
-            a, b = min(colour[p, band], 1.0), min(colour[p + size, band], 1.0)
-            c, d = min(colour[p + down, band], 1.0), min(colour[p + down + size, band], 1.0)
+            a, b = min(colour[p, band], white), min(colour[p + size, band], white)
+            c, d = min(colour[p + down, band], white), min(colour[p + down + size, band], white)
             if max(a, b, c, d) - min(a, b, c, d) > threshold:
                 uneven[i] = True
     return uneven
@@ -262,11 +269,12 @@ class _Bands:
         tracer: Tracer,
         rays: PinholeRays,
         threshold: float,
+        white: float,
         step: int,
         atomic: AtomicOptions | None,
         shared_boundary: bool,
     ) -> None:
-        self.tracer, self.rays, self.threshold, self.step = tracer, rays, threshold, step
+        self.tracer, self.rays, self.threshold, self.white, self.step = tracer, rays, threshold, white, step
         self.atomic, self.shared_boundary = atomic, shared_boundary
         self.columns = rays.width * step + 1
         shape = (rays.height, rays.width)
@@ -343,7 +351,7 @@ class _Bands:
 
     def _uneven(self, place: IntArray, size: int) -> NDArray[np.bool_]:
         """Which squares' corners differ by more than the threshold."""
-        return _corners_differ(self.colour, place, size, self.columns, self.threshold)
+        return _corners_differ(self.colour, place, size, self.columns, self.threshold, self.white)
 
     def _boundary_uneven(self, place: IntArray, size: int) -> NDArray[np.bool_]:
         """Which squares have a known sample on their boundary that makes them uneven."""
@@ -352,7 +360,7 @@ class _Bands:
                                             along * self.columns + size]))  # fmt: skip
         at = place[:, None] + offsets
         known = self.known[at][:, :, None]
-        colour = np.minimum(self.colour[at], 1.0)
+        colour = np.minimum(self.colour[at], self.white)
         highest = np.where(known, colour, -np.inf).max(axis=1)
         lowest = np.where(known, colour, np.inf).min(axis=1)
         return (highest - lowest).max(axis=1) > self.threshold
