@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,15 +162,22 @@ def shadow(
 
 
 def _check_folder(path: Path | None) -> None:
-    """Refuse, before the work, a folder that cannot take files."""
-    import os
-
-    if path is None:
-        return
-    while not path.exists() and path != path.parent:
-        path = path.parent
-    if not path.is_dir() or not os.access(path, os.W_OK):
-        raise InputError(f"{path}: found no folder that can be written in, expected one; give another")
+    """Refuse, before the work, a folder that cannot take files; leave no trace of the trial."""
+    made: list[Path] = []
+    try:
+        for folder in [*reversed(path.parents), path] if path is not None else []:
+            if not folder.exists():
+                folder.mkdir()
+                made.append(folder)
+        if path is not None:
+            probe = path / f".radiosity.{os.getpid()}.part"
+            probe.touch()
+            probe.unlink()
+    except OSError as problem:
+        raise InputError(f"{path}: cannot write here: {problem.strerror or problem}; give another folder") from None
+    finally:
+        for folder in reversed(made):
+            folder.rmdir()
 
 
 # ---- lights and points --------------------------------------------------------------------------
