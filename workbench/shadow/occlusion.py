@@ -650,8 +650,8 @@ class Shader:
         begin = time.perf_counter()
         found = camera_shadows(
             tiles.points, tiles.normals, pieces, geo, viewport=viewport,
-            mode="naive" if task.method == "camera" else "optimised", own_polygon=tiles.own, ignore=polygons if len(polygons) else None, tree=self._box_tree,
-            workers=self.workers,
+            mode="naive" if task.method == "camera" else "optimised", own_polygon=tiles.own,
+            ignore=polygons if len(polygons) else None, tree=self._box_tree, workers=self.workers,
         )  # fmt: skip
         task.counters.merge(found.counters)
         task.seconds["camera"] = task.seconds.get("camera", 0.0) + time.perf_counter() - begin
