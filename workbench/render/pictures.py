@@ -116,6 +116,23 @@ def _slab(name: str, material: Material, low: ArrayLike, high: ArrayLike) -> lis
     return sides
 
 
+def _room(floor: Material, walls: Material, low: ArrayLike, high: ArrayLike) -> list[Surface]:
+    """Floor, ceiling and four walls of a room, each a flat patch that fronts inward.
+
+    Rooms are closed, so that every reflected ray meets something, down to the last depth.
+    """
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    x, y, z = np.diag(high - low)
+    return [
+        _sheet("floor", floor, low, x, y, 12),
+        _sheet("ceiling", walls, low + z, y, x, 12),
+        _sheet("left wall", walls, low, y, z, 12),
+        _sheet("right wall", walls, low + x, z, y, 12),
+        _sheet("near wall", walls, low, z, x, 12),
+        _sheet("far wall", walls, low + y, x, z, 12),
+    ]
+
+
 def _leg(name: str, material: Material, at: ArrayLike, height: float, radius: float) -> Surface:
     profile = [(0.0, 0.0), (radius, 0.0), (0.8 * radius, 0.4 * height), (radius, 0.8 * height), (0.9 * radius, height)]
     return _moved(_lathe(name, material, profile, 24, 16), at)
@@ -159,8 +176,7 @@ def _pots(width: int, height: int) -> TestPicture:
         ),
     ]
     surfaces = [
-        _sheet("floor", floor, (-6, -6, 0), (12, 0, 0), (0, 10, 0), 12),
-        _sheet("wall", wall, (-6, 4, 0), (12, 0, 0), (0, 0, 7), 12),
+        *_room(floor, wall, (-6, -9, 0), (6, 4, 7)),
         *(_moved(part, (1.6, 0.6, 0.0), turn_deg=-35.0, scale=1.25) for part in chair),
         _moved(_lathe("pot", clay, _POT), (-1.2, -0.6, 0.0), scale=1.1),
         _moved(_lathe("jug", glaze, _JUG), (-2.6, 0.9, 0.0), scale=1.3),
@@ -171,7 +187,7 @@ def _pots(width: int, height: int) -> TestPicture:
     ]
     textures: dict[str, Texture] = {
         "floor": Checker(0.31, (0.95, 0.95, 0.95), (0.35, 0.32, 0.3), "xy", (0.013, 0.017, 0.0)),
-        "wall": Noise(0.08, 0.55, 1.0, 3, 2.5, seed=3),
+        "far wall": Noise(0.08, 0.55, 1.0, 3, 2.5, seed=3),
         "seat": Noise(0.07, 0.4, 1.0, 2, 2.0, seed=5),
         "pot": Noise(0.12, (0.5, 0.4, 0.35), 1.0, 3, 2.5, seed=8),
         "small pot": Noise(0.1, (0.5, 0.4, 0.35), 1.0, 3, 2.5, seed=9),
@@ -182,7 +198,7 @@ def _pots(width: int, height: int) -> TestPicture:
     )
     scene = Scene(
         "pots and a chair", tuple(surfaces), lights, _camera((-0.6, -7.2, 3.4), (-0.3, 0.3, 1.0), 36.0, width, height),
-        background=np.array([0.1, 0.12, 0.16]),
+        background=np.zeros(3),
     )  # fmt: skip
     return TestPicture(scene, textures, TraceOptions(falloff=False, ambient=0.12))
 
@@ -220,8 +236,7 @@ def _desk(width: int, height: int) -> TestPicture:
     ]
     top = 2.0
     surfaces = [
-        _sheet("carpet", carpet, (-6, -6, 0), (12, 0, 0), (0, 9, 0), 8),
-        _sheet("wall", wall, (-6, 2.2, 0), (12, 0, 0), (0, 0, 7), 8),
+        *_room(carpet, wall, (-6, -8, 0), (6, 2.2, 7)),
         *_slab("top", oak, (-2.4, -1.1, top - 0.12), (2.4, 1.3, top)),
         *_slab("drawers", oak, (-2.2, -1.0, 0.0), (-1.1, 1.2, top - 0.12)),
         *_slab("side", oak, (2.0, -1.0, 0.0), (2.2, 1.2, top - 0.12)),
@@ -242,12 +257,12 @@ def _desk(width: int, height: int) -> TestPicture:
         for surface in surfaces
         if surface.material is oak
     }
-    textures["carpet"] = Noise(0.06, 0.3, 1.0, 2, 3.0, seed=4)
-    textures["wall"] = Checker(0.11, 1.0, (0.72, 0.7, 0.66), "xz", (0.03, 0.0, 0.02))
+    textures["floor"] = Noise(0.06, 0.3, 1.0, 2, 3.0, seed=4)
+    textures["far wall"] = Checker(0.11, 1.0, (0.72, 0.7, 0.66), "xz", (0.03, 0.0, 0.02))
     textures["globe"] = Noise(0.15, (0.25, 0.4, 0.75), (0.5, 0.8, 0.4), 4, 4.0, seed=7)
     scene = Scene(
         "a desk", tuple(surfaces), (_point("lamp", (2.8, -4.2, 5.6), 2.4),),
-        _camera((1.0, -6.4, 4.4), (0.0, 0.0, 1.75), 36.0, width, height), background=np.array([0.1, 0.1, 0.12]),
+        _camera((1.0, -6.4, 4.4), (0.0, 0.0, 1.75), 36.0, width, height), background=np.zeros(3),
     )  # fmt: skip
     return TestPicture(scene, textures, TraceOptions(falloff=False, ambient=0.15))
 
@@ -287,16 +302,7 @@ def _spheres(width: int, height: int) -> TestPicture:
     places = [(-1.7, 0.4, 1.0, 1.0), (0.6, 1.5, 1.25, 1.25), (1.9, -0.7, 0.75, 0.75), (-0.3, -1.2, 0.6, 0.6),
               (-2.7, -1.5, 0.45, 0.45), (3.4, 1.2, 0.9, 0.9), (0.9, -2.2, 0.35, 0.35)]  # fmt: skip
     wall = _material("wall", (0.42, 0.5, 0.58), 0.06, 15.0)
-    low, high = np.array([-9.0, -9.0, 0.0]), np.array([9.0, 9.0, 9.5])
-    x, y, z = np.diag(high - low)
-    surfaces = [
-        _sheet("floor", floor, low, x, y, 12),
-        _sheet("ceiling", wall, low + z, y, x, 12),
-        _sheet("left wall", wall, low, y, z, 12),
-        _sheet("right wall", wall, low + x, z, y, 12),
-        _sheet("near wall", wall, low, z, x, 12),
-        _sheet("far wall", wall, low + y, x, z, 12),
-    ]
+    surfaces = _room(floor, wall, (-9, -9, 0), (9, 9, 9.5))
     surfaces += [
         _sphere(f"sphere {i}", mirrors[i % len(mirrors)], place[:3], place[3]) for i, place in enumerate(places)
     ]
@@ -319,8 +325,9 @@ def _tori(width: int, height: int) -> TestPicture:
         _material(f"metal {i}", colour, 0.3, 90.0)
         for i, colour in enumerate([(0.6, 0.45, 0.15), (0.5, 0.2, 0.15), (0.25, 0.4, 0.5), (0.4, 0.45, 0.3)])
     ]
+    wall = _material("wall", (0.45, 0.45, 0.5), 0.06, 15.0)
     surfaces = [
-        _sheet("floor", floor, (-12, -8, 0), (24, 0, 0), (0, 24, 0), 10),
+        *_room(floor, wall, (-9, -9, 0), (9, 9, 9)),
         _moved(_mesh("torus 0", metals[0], torus(1.0, 0.32), 96, 40), (-1.0, 0.0, 0.32)),
         _moved(_mesh("torus 1", metals[1], torus(0.9, 0.25), 96, 40), (0.1, 0.3, 1.1), turn_deg=25.0, tilt_deg=80.0),
         _moved(_mesh("torus 2", metals[2], torus(0.7, 0.24), 96, 40), (1.9, -0.5, 0.24)),
@@ -336,7 +343,7 @@ def _tori(width: int, height: int) -> TestPicture:
     )
     scene = Scene(
         "tori", tuple(surfaces), (light,), _camera((0.4, -6.4, 3.6), (0.4, 0.1, 0.5), 34.0, width, height),
-        background=np.array([0.08, 0.1, 0.14]),
+        background=np.zeros(3),
     )  # fmt: skip
     return TestPicture(scene, textures, TraceOptions(falloff=False, ambient=0.1, light_samples=8))
 
