@@ -12,6 +12,7 @@ from instrument_scenes import FAR, UNIT_SQUARE_LIGHT, geometry_of, nasty_polygon
 
 from workbench.accel.brute import BruteForce
 from workbench.errors import InputError, OptionError
+from workbench.geometry.polygons import convex_pieces, vector_area
 from workbench.geometry.tessellation import sphere_mesh
 from workbench.shadow.lights import (
     DirectionalLight,
@@ -71,7 +72,7 @@ def blocked_by_brute(geometry, points, normals, ring, own=-1, rays=24, seed=0):
     return blocked, above
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     count=st.integers(1, 12),
@@ -97,10 +98,16 @@ def test_states_are_never_wrong_against_brute_rays(seed, count, far, turned, con
         state = found.state[:, 0]
         np.testing.assert_array_equal(found.visible_share[state == LIT, 0], found.open_share[state == LIT, 0])
         assert (found.visible_share[state == DARK, 0] == 0.0).all()
-    lit, dark = exact.state[:, 0] == LIT, (exact.state[:, 0] == DARK) & (exact.open_share[:, 0] > 0.0)
-    pieces = [light] if not concave else [light[[0, 1, 2, 3]], light[[0, 3, 4, 5]]]
-    for ring in pieces:
-        blocked, above = blocked_by_brute(geometry, points + shift + 1e-9 * UP, normals, ring + shift, seed=seed)
+    # A sensor in the plane of a slanted polygon sees it edge on: it hides nothing, but rounded rays may meet it.
+    clear = np.ones(6, dtype=bool)
+    for polygon in polygons:
+        normal = vector_area(polygon) / np.linalg.norm(vector_area(polygon))
+        if abs(normal[2]) < 1 - 1e-9:
+            clear &= np.abs((points - polygon[0]) @ normal) > 1e-6
+    lit = clear & (exact.state[:, 0] == LIT)
+    dark = clear & (exact.state[:, 0] == DARK) & (exact.open_share[:, 0] > 0.0)
+    for ring in convex_pieces([light]):
+        blocked, above = blocked_by_brute(geometry, points + shift, normals, ring + shift, seed=seed)
         # A ray may graze what hides a null set: of a lit point none but such rays are blocked.
         assert (blocked & above)[lit].mean(axis=1).max(initial=0.0) <= 1 / 24
         assert (~blocked & above)[dark].mean(axis=1).max(initial=0.0) <= 1 / 24
