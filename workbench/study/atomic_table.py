@@ -114,7 +114,7 @@ def _details(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def atomic_study(
-    *, width: int = 640, height: int = 480, threshold: float = 0.07, level: int = 3, repeats: int = 3
+    *, width: int = 640, height: int = 480, threshold: float = 0.06, level: int = 3, repeats: int = 3
 ) -> StudyResult:
     """Table 1 for the four pictures of :mod:`workbench.render.pictures`.
 
