@@ -279,12 +279,15 @@ def forecast_elements(scene: Scene, edge: float, split: int = 2) -> int:
             n = np.where(n > 1, split * np.ceil(n / split), 1) ** 2
             small = _small_facets(surface, edge)
             if len(small):
-                corner = tri[small]
-                area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
                 n[small] = 0
-                # A curved surface crosses about twice as many cubes as its area asks for.
-                cubes = max(2.0 * float(area.sum()) / edge**2, COARSE_CLUSTERS)
-                total += sides * int(min(cubes, len(small)))
+                vector = np.cross(tri[small, 1] - tri[small, 0], tri[small, 2] - tri[small, 0])
+                area = 0.5 * np.linalg.norm(vector, axis=1)
+                normal = vector / np.maximum(2.0 * area, 1e-300)[:, None]
+                cell = min(edge, math.sqrt(float(area.sum()) / COARSE_CLUSTERS))
+                key = _cluster_keys(tri[small].mean(axis=1), normal, cell)
+                # One number a key: the count of distinct ones is all that is asked.
+                low, span = key.min(axis=0), np.ptp(key, axis=0) + 1
+                total += sides * len(np.unique(((key - low) * np.cumprod([1, *span[:-1]])).sum(axis=1)))
             total += sides * int(n.sum())
         else:
             total += sides * sum(_polygon_count(rings, edge, split) for rings in surface.faces())
@@ -322,16 +325,19 @@ def _small_facets(surface: Surface, edge: float) -> IntArray:
     return small if len(small) >= TESSELLATED else np.empty(0, np.int64)
 
 
+def _cluster_keys(centroid: FloatArray, normal: FloatArray, cell: float) -> IntArray:
+    """Cube and direction (n, 6) of each facet."""
+    place = np.floor((centroid - centroid.min(axis=0)) / cell).astype(np.int64)
+    return np.concatenate([place, np.floor((normal + 1.0) * 1.9999).astype(np.int64)], axis=1)
+
+
 def _clusters(centroid: FloatArray, normal: FloatArray, cell: float) -> tuple[IntArray, IntArray]:
     """Element of each facet, and patch of each element, by place and direction.
 
     Facets of one element share a cube of side ``cell`` and face the same of four directions an axis;
     patches join the elements of cubes twice as large and of one octant.
     """
-    place = np.floor((centroid - centroid.min(axis=0)) / cell).astype(np.int64)
-    facing = np.floor((normal + 1.0) * 1.9999).astype(np.int64)
-    key = np.concatenate([place, facing], axis=1)
-    distinct, element = np.unique(key, axis=0, return_inverse=True)
+    distinct, element = np.unique(_cluster_keys(centroid, normal, cell), axis=0, return_inverse=True)
     return element.ravel(), np.unique(distinct // 2, axis=0, return_inverse=True)[1].ravel()
 
 

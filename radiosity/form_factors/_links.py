@@ -48,6 +48,8 @@ POINTS = 4
 """Points at which a cluster of facets receives."""
 CLUSTER_FAR = 2.0
 """Distance, in extents of a cluster, beyond which its samples stand for it."""
+MAX_CELLS = 16384
+"""Cells of one element after which halving ends, whatever the wanted error: the doubt is stated."""
 MAX_CANDIDATES = 192
 """Longest candidate list handed down to a group; beyond it each point asks the tree itself."""
 
@@ -453,7 +455,9 @@ def _element_integral(
             state[0, 0], state[0, 1], state[0, 2], state[0, 3] = value, tolerance / fans, 0.0, 0.0
             state[0, 4] = open_value
             top = 0
+            cells_made = 0
             while top >= 0:
+                cells_made += 1
                 value, allowed, level = state[top, 0], state[top, 1], state[top, 2]
                 beside, open_value = state[top, 3] > 0.0, state[top, 4]
                 # The cell's own row becomes its last quarter, so quarters are made from a copy.
@@ -498,7 +502,7 @@ def _element_integral(
                     # A shadow edge lies between these points, and a rule and its quarters can place it
                     # alike and wrongly: by an eighth of the cell, say.
                     difference += 0.5 * (most - least) * _cell_area(parent, quad)
-                if difference <= 4.0 * allowed or level + 1.0 >= levels:
+                if difference <= 4.0 * allowed or level + 1.0 >= levels or cells_made > MAX_CELLS:
                     total += quarters
                     whole += clear
                     if clear > 0.0:

@@ -112,11 +112,13 @@ def visible_share(
         if m > MAX_CORNERS:
             return 0.0, -1
         lowest, highest = math.inf, -math.inf
+        span = reach
         for i in range(m):
             relative[i, 0] = corners[a + i, 0] - x
             relative[i, 1] = corners[a + i, 1] - y
             relative[i, 2] = corners[a + i, 2] - z
             off = mx * relative[i, 0] + my * relative[i, 1] + mz * relative[i, 2]
+            span = max(span, abs(relative[i, 0]), abs(relative[i, 1]), abs(relative[i, 2]))
             lowest = min(lowest, off)
             highest = max(highest, off)
         # Only what lies between the point and the sender's plane can block.
@@ -128,7 +130,8 @@ def visible_share(
             if m < 0:
                 return 0.0, -1
             blocker = clipped
-        used = _cone_planes(blocker, m, reach, planes) if m > 0 else 0
+        # Far corners round coarsely: flat is measured by how far this candidate reaches.
+        used = _cone_planes(blocker, m, span, planes) if m > 0 else 0
         if used == 0:
             continue
         tau = through[index]
