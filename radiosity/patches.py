@@ -24,7 +24,7 @@ from workbench.scene.model import Scene, Surface
 
 TESSELLATED = 64
 """Faces from which a surface counts as tessellated, so that its small facets are clustered."""
-COARSE_CLUSTERS = 48
+COARSE_CLUSTERS = 12
 """Least number of cubes over a tessellated surface, however coarse the mesh."""
 
 __all__ = ["PatchMesh", "build_mesh", "forecast_elements"]
@@ -320,8 +320,11 @@ def _small_facets(surface: Surface, edge: float) -> IntArray:
         return np.empty(0, np.int64)
     corner = surface.vertices[surface.ring_vertices]
     starts = surface.ring_offsets[:-1]
-    extent = np.maximum.reduceat(corner, starts) - np.minimum.reduceat(corner, starts)
-    small = np.flatnonzero(extent.max(axis=1) <= edge)
+    low, high = np.minimum.reduceat(corner, starts), np.maximum.reduceat(corner, starts)
+    # The box of a facet bounds its area: good enough to tell a wall from a facet of a statue.
+    extent = np.sort(high - low, axis=1)
+    largest = math.sqrt(float((extent[:, 1] * extent[:, 2]).sum()) / COARSE_CLUSTERS)
+    small = np.flatnonzero(extent[:, 2] <= min(edge, 0.5 * largest))
     return small if len(small) >= TESSELLATED else np.empty(0, np.int64)
 
 
