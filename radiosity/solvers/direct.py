@@ -11,19 +11,17 @@ from numpy.typing import NDArray
 from radiosity.form_factors.bundle import ReceiverBundles
 from radiosity.solvers.solution import Progress, ProgressEvent, Solution
 
-__all__ = ["COVERED", "balance_rows", "solve_direct"]
+__all__ = ["balance_rows", "solve_direct"]
 
 FloatArray = NDArray[np.float64]
 
 COLUMNS_A_STEP = 32
-COVERED = 0.5
-"""Row sum below which an element of a closed scene counts as covered (the floor under a box), not as in error."""
+COVERED = 0.01
+"""Share of an element of a closed scene that must see nothing to count as covered (the floor under a box)."""
 
 
 def balance_rows(exchange: FloatArray, areas: FloatArray, rounds: int = 200) -> FloatArray:
-    """Scale exchange areas so that each row of form factors sums to 1, keeping reciprocity.
-
-    Rows that sum to less than :data:`COVERED` are left as they are: such an element sees hardly anything.
+    """Scale exchange areas so that each row sums to an area, keeping reciprocity; rows of nothing stay.
 
     The symmetric matrix S is scaled to ``x_i x_j S_ij`` with row sums ``A_i`` (cf. J. van Leersum,
     "A method for determining a consistent set of radiation view factors", 1989; here by symmetric
@@ -34,6 +32,7 @@ def balance_rows(exchange: FloatArray, areas: FloatArray, rounds: int = 200) -> 
     exchange : (n, n) float
         Symmetric exchange areas A_i F_ij of a closed scene.
     areas : (n,) float
+        Wanted row sums: the elements' areas, without what is covered of them.
     rounds : int
         Most iterations; it ends once the rows agree to 1e-14.
 
@@ -42,7 +41,7 @@ def balance_rows(exchange: FloatArray, areas: FloatArray, rounds: int = 200) -> 
     (n, n) float
     """
     x = np.ones(len(areas))
-    open_rows = exchange.sum(axis=1) >= COVERED * areas
+    open_rows = exchange.any(axis=1) & (areas > 0)
     for _ in range(rounds):
         ratio = np.divide(areas, x * (exchange @ x), out=np.ones(len(areas)), where=open_rows)
         x *= np.sqrt(ratio)
@@ -92,17 +91,28 @@ def solve_direct(
         }
         record.errors["reciprocity"] = float(np.abs(exchange - exchange.T).max() / scale)
         exchange = 0.5 * (exchange + exchange.T)
+        visible = np.ones(n)
         if closed:
-            balanced = balance_rows(exchange, area)
+            # A row far from 1 is no error of form factors: something lies on the element.  What is left
+            # of it is all that exchanges light, and its row sums to 1.
+            sums = exchange.sum(axis=1) / area
+            covered = 1.0 - sums > np.maximum(3.0 * doubt, COVERED)
+            visible[covered] = sums[covered]
+            balanced = balance_rows(exchange, area * visible)
             record.errors["row_balance_correction"] = float(np.abs(balanced - exchange).max() / scale)
+            record.results["covered_elements"] = int(covered.sum())
             exchange = balanced
-        factor = exchange / area[:, None]
-        before = solution.unshot.copy()
+        share = np.where(visible > 0, visible, 1.0)[:, None]
+        factor = exchange / (area[:, None] * share)
+        # Light that came from outside fell on the visible part, too.
+        before = mesh.emission + (solution.unshot - mesh.emission) / share
+        seen = np.empty_like(before)
         for band in range(mesh.bands):
             rho = mesh.reflectance[:, band]
             system = np.eye(n) - rho[:, None] * factor
-            solution.radiosity[:, band] = scipy.linalg.solve(system, before[:, band])
-        arriving = factor @ solution.radiosity
+            seen[:, band] = scipy.linalg.solve(system, before[:, band])
+        arriving = visible[:, None] * (factor @ seen)
+        solution.radiosity += mesh.reflectance * arriving
         solution.irradiance += arriving
         solution.unshot[:] = 0.0
         book = solution.book

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radiosity.form_factors.bundle import ReceiverBundles
-from radiosity.solvers.direct import COVERED
 from radiosity.solvers.solution import Progress, ProgressEvent, Solution
 from workbench.memory import available_bytes
 
@@ -38,6 +37,8 @@ SOLVE_LIMIT = 3000
 """Most patches whose last bounces are solved at once."""
 FLOOR_SHARE = 0.1
 """Share of the wanted error that one patch may bring to an irradiance."""
+LEAST_ROW_SUM = 0.1
+"""A patch of a closed scene that sees less than this is covered, and shoots as it is."""
 CACHE_SHARE = 0.25
 """Share of the free memory that kept form factors may take."""
 
@@ -174,7 +175,7 @@ def shoot_until(
                         known.add(patch)
                         sums.append(row_sum)
                         doubts.append(float(columns.spread[row] @ mesh.element_area / mesh.patch_area[patch]))
-                    if solution.scene.closed and row_sum >= COVERED:
+                    if solution.scene.closed and row_sum >= LEAST_ROW_SUM:
                         factor = factor / row_sum  # in an enclosure all that is shot arrives
                     rows[patch] = factor
                     if len(cache) < room:
