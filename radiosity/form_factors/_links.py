@@ -48,7 +48,7 @@ POINTS = 4
 """Points at which a cluster of facets receives."""
 CLUSTER_FAR = 2.0
 """Distance, in extents of a cluster, beyond which its samples stand for it."""
-MAX_CELLS = 16384
+MAX_CELLS = 131072
 """Cells of one element after which halving ends, whatever the wanted error: the doubt is stated."""
 MAX_CANDIDATES = 192
 """Longest candidate list handed down to a group; beyond it each point asks the tree itself."""
