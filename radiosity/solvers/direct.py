@@ -96,7 +96,7 @@ def solve_direct(
             # A row far from 1 is no error of form factors: something lies on the element.  What is left
             # of it is all that exchanges light, and its row sums to 1.
             sums = exchange.sum(axis=1) / area
-            covered = 1.0 - sums > np.maximum(3.0 * doubt, COVERED)
+            covered = 1.0 - sums > np.maximum(doubt, COVERED)
             visible[covered] = sums[covered]
             balanced = balance_rows(exchange, area * visible)
             record.errors["row_balance_correction"] = float(np.abs(balanced - exchange).max() / scale)

@@ -42,21 +42,20 @@ def _form_factor_error(elements: int, method: str) -> float:
     """Default accuracy of form factors: what costs nothing is done well."""
     if elements <= EXACT_ELEMENTS:
         return 1e-8
-    if elements <= DIRECT_ELEMENTS:
-        return 1e-4
-    return 1e-3 if method == "direct" else 0.02
+    return 1e-3 if method == "direct" or elements <= DIRECT_ELEMENTS else 0.02
 
 
 def _settings(error: float, rays: int, seed: int, patches: int) -> LinkSettings:
     """Link settings for a relative form-factor error."""
-    tight = error < 1e-3
+    tight = error <= 1e-3
     return LinkSettings(
         rays=rays,
         error=error,
         floor=0.1 * error / max(patches, 1),
         candidates=40 if tight else 12,
-        # Each level halves an element; a shadow edge needs about log2(1 / error) of them.
-        levels=min(max(3, math.ceil(math.log2(1.0 / error)) - 2), 20),
+        # Each level halves the cells along a shadow edge, which cost twice as much; an element's mean
+        # carries what is left, and the stated error says so.
+        levels=min(max(3, math.ceil(math.log2(1.0 / error)) - 2), 5 if error >= 1e-3 else 7 if error >= 1e-5 else 20),
         closed_forms=tight,
         seed=seed,
     )
