@@ -258,7 +258,7 @@ def _sampled(rng, point, normal, sender, polygons, count):
     return value.mean(), value.std() / np.sqrt(count), weight
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, derandomize=True)  # statistics: the same scenes each time
 @given(seed=st.integers(0, 2**32 - 1))
 def test_agrees_with_rays_through_any_occluders(seed):
     rng = np.random.default_rng(seed)

@@ -248,7 +248,7 @@ def test_shafts_and_certificates_save_work():
         assert (columns.factor[1, 0] == 0) == dark
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15, deadline=None, derandomize=True)  # statistics: the same scenes each time
 @given(seed=st.integers(0, 2**32 - 1))
 def test_whole_columns_agree_with_rays(seed):
     # The end of the chain: facing, shafts, certificates, cuts and quadrature together.  The form factor is the
