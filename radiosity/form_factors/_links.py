@@ -942,6 +942,11 @@ def shoot(
             # The open factor is known better than by these points.  What they miss of it (along an edge
             # that both polygons touch, say) is as visible as the cells where they miss most.
             missed = open_factor * area - whole
+            if abs(missed) > 0.25 * open_factor * area:
+                # Most of what is seen lies where no point does (planes that cross): rays find it.
+                factor[e] = open_factor
+                rays[e] = True
+                continue
             share = min(max((value + missed * local) / (open_factor * area), 0.0), 1.0)
             factor[e] = open_factor * share
             spread[e] = doubt / area + 0.25 * abs(missed) / area * (1.0 - abs(2.0 * local - 1.0))
