@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
-from workbench.geometry.polygons import convex_pieces, plane_basis, vector_area
+from workbench.geometry.polygons import convex_pieces, fan_triangles, plane_basis, vector_area
 from workbench.scene.model import Scene, Surface
 
 TESSELLATED = 64
@@ -504,17 +504,8 @@ def _element_normals(
     return np.ascontiguousarray(normal)
 
 
-def _fans(corners: FloatArray, starts: IntArray) -> tuple[FloatArray, IntArray]:
-    """Fan triangles (t, 3, 3) of rings, and the ring (t,) of each."""
-    counts = np.diff(starts) - 2
-    ring = np.repeat(np.arange(len(counts)), counts)
-    first = np.repeat(starts[:-1], counts)
-    step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    return corners[np.stack([first, first + step + 1, first + step + 2], axis=1)], ring.astype(np.int64)
-
-
 def _vector_areas(corners: FloatArray, starts: IntArray) -> FloatArray:
-    tri, ring = _fans(corners, starts)
+    tri, ring = fan_triangles(corners, starts)
     out = np.zeros((len(starts) - 1, 3))
     np.add.at(out, ring, 0.5 * np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]))
     return out
@@ -523,7 +514,7 @@ def _vector_areas(corners: FloatArray, starts: IntArray) -> FloatArray:
 def _area_and_centroid(
     corners: FloatArray, starts: IntArray, owner: IntArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    tri, ring = _fans(corners, starts)
+    tri, ring = fan_triangles(corners, starts)
     part = 0.5 * np.linalg.norm(np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]), axis=1)
     who = owner[ring]
     area = np.bincount(who, part, count).astype(np.float64)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.errors import InputError, SceneError
-from workbench.geometry.polygons import convex_pieces, vector_area
+from workbench.geometry.polygons import convex_pieces, fan_triangles, vector_area
 from workbench.scene.model import Material, Scene
 
 __all__ = ["Geometry"]
@@ -112,12 +112,7 @@ class Geometry:
     @cached_property
     def triangles(self) -> tuple[FloatArray, IntArray]:
         """Fan triangles (t, 3, 3) of all pieces, and the piece (t,) of each."""
-        counts = np.diff(self.piece_start) - 2
-        piece = np.repeat(np.arange(self.piece_count), counts)
-        first = np.repeat(self.piece_start[:-1], counts)
-        step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-        index = np.stack([first, first + step + 1, first + step + 2], axis=1)
-        return np.ascontiguousarray(self.corners[index]), piece.astype(np.int64)
+        return fan_triangles(self.corners, self.piece_start)
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Geometry:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from workbench.errors import InputError
 
-__all__ = ["check_polygon", "convex_pieces", "is_convex", "plane_basis", "vector_area"]
+__all__ = ["check_polygon", "convex_pieces", "fan_triangles", "is_convex", "plane_basis", "vector_area"]
 
 FloatArray = NDArray[np.float64]
 
@@ -75,6 +75,18 @@ def check_polygon(rings: Sequence[FloatArray]) -> str | None:
     if off > PLANARITY * extent:
         return f"a non-planar polygon: a vertex lies {off:.3g} off the plane, {off / extent:.2g} of its size"
     return None
+
+
+def fan_triangles(corners: FloatArray, starts: NDArray[np.int64]) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Fan triangles (t, 3, 3) of convex rings, and the ring (t,) of each.
+
+    Ring ``i`` is ``corners[starts[i]:starts[i + 1]]``.
+    """
+    counts = np.diff(starts) - 2
+    ring = np.repeat(np.arange(len(counts)), counts).astype(np.int64)
+    first = np.repeat(starts[:-1], counts)
+    step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.ascontiguousarray(corners[np.stack([first, first + step + 1, first + step + 2], axis=1)]), ring
 
 
 def convex_pieces(rings: Sequence[FloatArray]) -> list[FloatArray]:
