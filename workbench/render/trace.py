@@ -21,6 +21,7 @@ import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,10 +38,11 @@ from workbench.render.atomic import NO_SURFACE, Guide, RayTrees
 from workbench.render.textures import Texture
 from workbench.scene.model import Light, Scene, Surface
 
-__all__ = ["ComponentCount", "RayTally", "TraceOptions", "Traced", "Tracer"]
+__all__ = ["ComponentCount", "DiffuseEnds", "RayTally", "TraceOptions", "Traced", "Tracer"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+_Work = TypeVar("_Work")
 
 BLOCK_RAYS = 16384
 """Samples a block: their wavefront stays in cache."""
@@ -178,6 +180,65 @@ class Traced:
     surface: IntArray
     saved: IntArray
     tally: RayTally
+
+
+@dataclass(frozen=True)
+class DiffuseEnds:
+    """The points at which rays see a diffuse surface: directly, in mirrors, through glass.
+
+    A row an end; a ray has none (it meets nothing, or black), one, or many (a surface both diffuse
+    and mirroring is an end and leads on to others).  Their order does not depend on the workers.
+
+    Parameters
+    ----------
+    ray : (m,) int
+        The ray, a row of those traced.
+    points : (m, 3) float
+        On the surface, not lifted off it.
+    normals : (m, 3) float
+        Unit shading normals on the side that is seen: interpolated where the surface is smooth.
+    facing : (m, 3) float
+        Unit normals of the polygons on the same side.
+    surface, polygon : (m,) int
+        Of the scene, and of its geometry.
+    front : (m,) bool
+        Whether the front is seen; a back only where the material is two-sided or lets light through.
+    depth : (m,) int
+        Reflections and refractions before the end.
+    throughput : (m, bands) float
+        Product of the specular and transmitted shares along the path, divided by the rays of a bundle.
+    reflectance : (m, bands) float
+        Diffuse, with its texture; not part of ``throughput``.
+    radiance : (n, bands) float
+        What the ``n`` rays bring beside the ends' reflected light: emission seen, background,
+        ambient light, and highlights of the scene's lights on shiny surfaces. [W m-2 sr-1]
+    tally : RayTally
+        Shadow rays in it went to highlights.
+    """
+
+    ray: IntArray
+    points: FloatArray
+    normals: FloatArray
+    facing: FloatArray
+    surface: IntArray
+    polygon: IntArray
+    front: NDArray[np.bool_]
+    depth: IntArray
+    throughput: FloatArray
+    reflectance: FloatArray
+    radiance: FloatArray
+    tally: RayTally
+
+    def radiance_with(self, irradiance: ArrayLike) -> FloatArray:
+        """Radiance (n, bands) of the rays when the ends have ``irradiance`` (m, bands) in W/m2."""
+        received = np.asarray(irradiance, dtype=np.float64)
+        if received.shape != self.throughput.shape:
+            raise InputError(
+                f"irradiance: found shape {received.shape}, expected {self.throughput.shape}, a row an end"
+            )
+        found = self.radiance.copy()
+        np.add.at(found, self.ray, self.throughput * self.reflectance / np.pi * received)
+        return found
 
 
 @dataclass(frozen=True)
@@ -447,14 +508,9 @@ class Tracer:
         InputError
             If shapes do not agree or values are not finite.
         """
-        along = as_unit_vectors(directions, "directions")
-        count = len(along)
-        start = as_points(origins, "origins")
-        if len(start) not in (1, count):
-            raise InputError(f"origins and directions: found {len(start)} and {count} rows, expected as many")
+        start, along, number = _as_rays(origins, directions, keys)
         if guide is not None and (guide_rows is None or place is None):
             raise InputError("guide: found no guide_rows or place, expected both")
-        number = np.arange(count) if keys is None else np.asarray(keys)
         return self.trace_unchecked(start, along, number, record, guide, guide_rows, place)
 
     def trace_unchecked(
@@ -478,34 +534,73 @@ class Tracer:
         saved = np.zeros(count, dtype=np.int64)
 
         def work(rows: slice) -> RayTally:
-            wave = _Wave(
-                np.ascontiguousarray(np.broadcast_to(start if len(start) == 1 else start[rows], along[rows].shape)),
-                along[rows],
-                salted[rows],
-                np.arange(rows.stop - rows.start),
-                np.zeros(rows.stop - rows.start, dtype=np.int64),
-            )
             sweep = _Sweep(
                 self,
-                RayTally([ComponentCount() for _ in self._lights]),
+                self.no_rays(),
                 None if record is None else record.rows(rows),
                 None if guided is None else guided.rows(rows),
                 surface[rows],
                 saved[rows],
             )
-            radiance[rows] = sweep.follow(wave, 0)
+            radiance[rows] = sweep.follow(_first_wave(start, along, salted, rows), 0)
             return sweep.tally
 
-        blocks = [slice(i, min(i + BLOCK_RAYS, count)) for i in range(0, count, BLOCK_RAYS)]
-        if self.workers > 1 and len(blocks) > 1:
-            with ThreadPoolExecutor(self.workers) as pool:
-                tallies = list(pool.map(work, blocks))
-        else:
-            tallies = [work(rows) for rows in blocks]
-        tally = RayTally([ComponentCount() for _ in self._lights])
-        for part in tallies:
+        tally = self.no_rays()
+        for part in self._in_blocks(count, work):
             tally.add(part)
         return Traced(radiance, surface, saved, tally)
+
+    def trace_to_diffuse(
+        self, origins: ArrayLike, directions: ArrayLike, *, keys: IntArray | None = None
+    ) -> DiffuseEnds:
+        """Follow rays through mirrors, glass and fuzzy bundles to all the diffuse surfaces that they see.
+
+        What a final gather needs: the points whose irradiance makes the picture, and with what
+        weight.  With direct irradiance alone :meth:`DiffuseEnds.radiance_with` gives the radiance of
+        :meth:`trace`; the more irradiance it is given, the more of the light is in the picture.
+        Directions of bundles are those of :meth:`trace` for the same ``keys``.
+
+        Parameters
+        ----------
+        origins : (n, 3) or (3,) float
+        directions : (n, 3) float
+            Unit vectors.
+        keys : (n,) int, optional
+            Number of each ray from which its random numbers come; 0, 1, 2... unless given.
+
+        Raises
+        ------
+        InputError
+            If shapes do not agree or values are not finite.
+        """
+        start, along, number = _as_rays(origins, directions, keys)
+        count = len(along)
+        salted = kernels.child_keys(number.astype(np.uint64), self.options.seed, 1)
+        surface, saved = np.empty(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+        radiance = np.empty((count, self.bands))
+
+        def work(rows: slice) -> tuple[RayTally, list[tuple[NDArray, ...]]]:
+            sweep = _Sweep(self, self.no_rays(), None, None, surface[rows], saved[rows])
+            radiance[rows], ends = sweep.diffuse_ends(_first_wave(start, along, salted, rows))
+            return sweep.tally, [(end[0] + rows.start, *end[1:]) for end in ends]
+
+        tally, parts = self.no_rays(), []
+        for found, ends in self._in_blocks(count, work):
+            tally.add(found)
+            parts += ends
+        return DiffuseEnds(*(np.concatenate(column) for column in zip(*parts, strict=True)), radiance, tally)
+
+    def no_rays(self) -> RayTally:
+        """A tally of nothing yet."""
+        return RayTally([ComponentCount() for _ in self._lights])
+
+    def _in_blocks(self, count: int, work: Callable[[slice], _Work]) -> list[_Work]:
+        """``work`` on each block of ``count`` rays, over the threads; always one block or more."""
+        blocks = [slice(i, min(i + BLOCK_RAYS, count)) for i in range(0, max(count, 1), BLOCK_RAYS)]
+        if self.workers > 1 and len(blocks) > 1:
+            with ThreadPoolExecutor(self.workers) as pool:
+                return list(pool.map(work, blocks))
+        return [work(rows) for rows in blocks]
 
     # ---- what the sweep asks of the scene
 
@@ -536,6 +631,32 @@ class Tracer:
             rest = rest * (1.0 - step)[:, None]
         through[rows] = 0.0
         return through
+
+
+def _as_rays(
+    origins: ArrayLike, directions: ArrayLike, keys: IntArray | None
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Rays checked: origins (n or 1, 3), unit directions (n, 3) and their numbers (n,)."""
+    along = as_unit_vectors(directions, "directions")
+    count = len(along)
+    start = as_points(origins, "origins")
+    if len(start) not in (1, count):
+        raise InputError(f"origins and directions: found {len(start)} and {count} rows, expected as many")
+    number = np.arange(count) if keys is None else np.asarray(keys)
+    if number.shape != (count,):
+        raise InputError(f"keys: found shape {number.shape}, expected {(count,)}, one a ray")
+    return start, along, number
+
+
+def _first_wave(start: FloatArray, along: FloatArray, keys: NDArray[np.uint64], rows: slice) -> _Wave:
+    """The cast rays of a block."""
+    return _Wave(
+        np.ascontiguousarray(np.broadcast_to(start if len(start) == 1 else start[rows], along[rows].shape)),
+        along[rows],
+        keys[rows],
+        np.arange(len(along[rows])),
+        np.zeros(len(along[rows]), dtype=np.int64),
+    )
 
 
 @dataclass(frozen=True)
@@ -574,6 +695,7 @@ class _Found:
 
     ray: IntArray
     surface: NDArray[np.int32]
+    polygon: IntArray
     points: FloatArray
     facing: FloatArray
     shading: FloatArray
@@ -616,13 +738,7 @@ class _Sweep:
             radiance[:] = tracer.scene.background
         if count == 0:
             return radiance
-        lit, reflectance = np.empty(count, dtype=bool), np.empty((count, tracer.bands))
-        kernels.begin(found.surface, found.front, materials.both_sides, materials.reflectance, lit, reflectance)
-        for index, texture in tracer._textures.items():
-            rows = np.flatnonzero(found.surface == index)
-            if len(rows):
-                kernels.scale_rows(rows, texture(found.points.take(rows, axis=0)), reflectance)
-        mirrored = kernels.mirror(found.directions, found.shading, found.facing, found.surface, materials.mirrors)
+        lit, reflectance, mirrored = self._begin(found)
         leaving = radiance if count == len(radiance) else np.empty((count, tracer.bands))
         kernels.sent_unlit(found.surface, lit, reflectance, materials.radiance, tracer._ambient, leaving)
         self._light(wave, found, lit, reflectance, mirrored, leaving)
@@ -631,6 +747,59 @@ class _Sweep:
         if leaving is not radiance:
             radiance[found.ray] = leaving
         return radiance
+
+    def _begin(self, found: _Found) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+        """Whether each hit's side is lit, its reflectance, and its mirrored direction."""
+        tracer, materials, count = self.tracer, self.tracer._materials, len(found.ray)
+        lit, reflectance = np.empty(count, dtype=bool), np.empty((count, tracer.bands))
+        kernels.begin(found.surface, found.front, materials.both_sides, materials.reflectance, lit, reflectance)
+        for index, texture in tracer._textures.items():
+            rows = np.flatnonzero(found.surface == index)
+            if len(rows):
+                kernels.scale_rows(rows, texture(found.points.take(rows, axis=0)), reflectance)
+        mirrored = kernels.mirror(found.directions, found.shading, found.facing, found.surface, materials.mirrors)
+        return lit, reflectance, mirrored
+
+    def diffuse_ends(self, wave: _Wave) -> tuple[FloatArray, list[tuple[NDArray, ...]]]:
+        """Radiance (n, bands) beside what diffuse surfaces reflect, and these: columns of :class:`DiffuseEnds`."""
+        tracer, materials = self.tracer, self.tracer._materials
+        radiance = np.zeros((len(wave.sample), tracer.bands))
+        throughput = np.ones_like(radiance)
+        ends: list[tuple[NDArray, ...]] = []
+        for depth in range(tracer.options.depth + 1):
+            found = self._hits(wave, depth)
+            missed = np.ones(len(wave.sample), dtype=bool)
+            missed[found.ray] = False
+            np.add.at(radiance, wave.sample[missed], throughput[missed] * tracer.scene.background)
+            throughput = throughput[found.ray]
+            lit, reflectance, mirrored = self._begin(found)
+            leaving = np.empty_like(throughput)
+            kernels.sent_unlit(found.surface, lit, reflectance, materials.radiance, tracer._ambient, leaving)
+            shiny = lit & (materials.highlight_exponent[found.surface] >= 0.0)
+            if shiny.any():
+                self._light(wave, found, shiny, np.zeros_like(reflectance), mirrored, leaving, highlights_only=True)
+            np.add.at(radiance, found.sample, throughput * leaving)
+            rows = np.flatnonzero(lit & reflectance.any(axis=1))
+            ends.append(
+                (
+                    found.sample[rows], found.points[rows], found.shading[rows], found.facing[rows],
+                    found.surface[rows].astype(np.int64), found.polygon[rows], found.front[rows],
+                    np.full(len(rows), depth), throughput[rows], reflectance[rows],
+                )
+            )  # fmt: skip
+            if depth == tracer.options.depth:
+                break
+            copies = tracer.options.bundle if depth == 0 else 1
+            reflecting, passing = self._leading_on(found, lit)
+            wave = self._next_wave(wave, found, reflecting, passing, mirrored, copies)
+            shares = [
+                throughput[rows] * share[found.surface[rows]] / copies
+                for rows, share in ((reflecting, materials.specular), (passing, materials.transmittance))
+            ]
+            throughput = np.repeat(np.concatenate(shares), copies, axis=0)
+            if len(throughput) == 0:
+                break
+        return radiance, ends
 
     # ---- hits
 
@@ -677,15 +846,15 @@ class _Sweep:
         if depth == 0:
             self.tally.cast_hits += len(ray)
         agreed, pixel = np.zeros(len(ray), dtype=bool), np.empty(0, dtype=np.int64)
-        parts = (surface, points, facing, shading, front, wave.directions, wave.sample, wave.node)
+        parts = (surface, polygon, points, facing, shading, front, wave.directions, wave.sample, wave.node)
         if len(ray) < count:
             parts = tuple(part.take(ray, axis=0) for part in parts)  # type: ignore[assignment]
-        surface, points, facing, shading, front, directions, sample, node = parts
+        surface, polygon, points, facing, shading, front, directions, sample, node = parts
         if self.guided is not None:
             guide = self.guided.guide
             pixel = self.guided.row[sample]
             kernels.agreement(pixel, node, surface, shading, guide.surface, guide.normal, guide.cosine, agreed)
-        return _Found(ray, surface, points, facing, shading, front, directions, sample, node, pixel, agreed)
+        return _Found(ray, surface, polygon, points, facing, shading, front, directions, sample, node, pixel, agreed)
 
     def _pass_backs(
         self,
@@ -730,8 +899,9 @@ class _Sweep:
         reflectance: FloatArray,
         mirrored: FloatArray,
         leaving: FloatArray,
+        highlights_only: bool = False,
     ) -> None:
-        """Add the light of every light to ``leaving`` (n, bands)."""
+        """Add the light of every light to ``leaving`` (n, bands); or of those only that make highlights."""
         tracer, count, materials = self.tracer, len(found.ray), self.tracer._materials
         centre, unit = tracer._opaque.frame
         keys = wave.keys[found.ray] if tracer.options.jitter else wave.keys[:0]
@@ -743,6 +913,8 @@ class _Sweep:
         weight, lobe_weight, owner = np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
         recorded = found.node >= 0
         for index, light in enumerate(tracer._lights):
+            if highlights_only and not light.highlight:
+                continue
             if self.guided is not None:
                 kernels.assume(found.agreed, found.pixel, found.node, self.guided.guide.state, index, assumed)
             targets, axes = self._targets(light, index, keys)
@@ -792,33 +964,14 @@ class _Sweep:
     ) -> None:
         """Add what reflected and refracted rays bring, all of them one wave."""
         materials = self.tracer._materials
-        reflecting = np.flatnonzero(materials.mirrors.take(found.surface) & lit)
-        passing = (
-            np.flatnonzero(materials.clear.take(found.surface))
-            if self.tracer._panes is not None
-            else np.empty(0, dtype=np.int64)
-        )
+        reflecting, passing = self._leading_on(found, lit)
         copies = self.tracer.options.bundle if depth == 0 else 1
         if self.guided is not None:
             reflecting = self._interpolate("reflection", found, reflecting, leaving, copies)
             passing = self._interpolate("refraction", found, passing, leaving, copies)
         if len(reflecting) + len(passing) == 0:
             return
-        reflected = self._next(
-            wave, found, reflecting, mirrored.take(reflecting, axis=0), np.ones(len(reflecting)), 1, copies
-        )
-        both = reflected
-        if len(passing):
-            bent, inside = kernels.refract(
-                found.directions[passing], found.shading[passing], found.facing[passing], found.front[passing],
-                materials.ior[found.surface[passing]],
-            )  # fmt: skip
-            refracted = self._next(wave, found, passing, bent, np.where(inside, 1.0, -1.0), 2, copies)
-            both = _Wave(
-                *(np.concatenate([getattr(w, part.name) for w in (reflected, refracted)]) for part in fields(_Wave))
-            )
-        self.tally.reflection.shot += len(reflecting) * copies
-        self.tally.refraction.shot += len(passing) * copies
+        both = self._next_wave(wave, found, reflecting, passing, mirrored, copies)
         brought = self.follow(both, depth + 1)
         if copies > 1:
             brought = brought.reshape(-1, copies, self.tracer.bands).mean(axis=1)
@@ -833,6 +986,35 @@ class _Sweep:
                 node = found.node[rows]
                 recorded = node >= 0
                 getattr(self.record, name)[found.sample[rows[recorded]], node[recorded]] = values[recorded]
+
+    def _leading_on(self, found: _Found, lit: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
+        """Rows of the hits that reflect, and of those that let light pass."""
+        materials = self.tracer._materials
+        reflecting = np.flatnonzero(materials.mirrors.take(found.surface) & lit)
+        if self.tracer._panes is None:
+            return reflecting, np.empty(0, dtype=np.int64)
+        return reflecting, np.flatnonzero(materials.clear.take(found.surface))
+
+    def _next_wave(
+        self, wave: _Wave, found: _Found, reflecting: IntArray, passing: IntArray, mirrored: FloatArray, copies: int
+    ) -> _Wave:
+        """Reflected rays, then refracted ones, ``copies`` of each row."""
+        materials = self.tracer._materials
+        self.tally.reflection.shot += len(reflecting) * copies
+        self.tally.refraction.shot += len(passing) * copies
+        reflected = self._next(
+            wave, found, reflecting, mirrored.take(reflecting, axis=0), np.ones(len(reflecting)), 1, copies
+        )
+        if len(passing) == 0:
+            return reflected
+        bent, inside = kernels.refract(
+            found.directions[passing], found.shading[passing], found.facing[passing], found.front[passing],
+            materials.ior[found.surface[passing]],
+        )  # fmt: skip
+        refracted = self._next(wave, found, passing, bent, np.where(inside, 1.0, -1.0), 2, copies)
+        return _Wave(
+            *(np.concatenate([getattr(w, part.name) for w in (reflected, refracted)]) for part in fields(_Wave))
+        )
 
     def _next(
         self,
