@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -588,7 +588,8 @@ class Tracer:
         for found, ends in self._in_blocks(count, work):
             tally.add(found)
             parts += ends
-        return DiffuseEnds(*(np.concatenate(column) for column in zip(*parts, strict=True)), radiance, tally)
+        columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return DiffuseEnds(*[*columns, radiance, tally])
 
     def no_rays(self) -> RayTally:
         """A tally of nothing yet."""
