@@ -166,7 +166,14 @@ def solve(
             previous = radiosity.Solution.load(directory)
             options |= _asked_before(previous.record.settings, options)
         with _progress() as report:
-            solution = radiosity.solve(loaded, workers=workers, progress=report, resume=previous, **options)
+            solution = radiosity.solve(
+                loaded,
+                workers=workers,
+                progress=report,
+                checkpoint=lambda unfinished: unfinished.save_state(directory),
+                resume=previous,
+                **options,
+            )
         solution.record.seconds = {"read scene": seconds_reading} | solution.record.seconds
         _save(solution, directory, preview=not no_preview, json_path=json_path)
     names = ["solution.vtp", "solution.npz", "record.json"] + ([] if no_preview else ["preview.png"])

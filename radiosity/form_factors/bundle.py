@@ -97,12 +97,14 @@ class Columns:
 
     ``factor`` (k, n): row ``j`` holds F from each element to patch ``patches[j]``, averaged over the
     element.  ``spread`` (k, n): its estimated error (quadrature difference, or one standard error
-    of the rays).
+    of the rays).  ``mean_square`` (k, 2): area-weighted mean of the squared error, of form factors found
+    by formula and of those found by rays.
     """
 
     patches: NDArray[np.int64]
     factor: FloatArray
     spread: FloatArray
+    mean_square: FloatArray
 
 
 # Generalised golden ratio in four dimensions (M. Roberts 2018): g solves g^5 = g + 1.
@@ -264,6 +266,11 @@ class ReceiverBundles:
         """Stop the threads."""
         self._pool.shutdown()
 
+    def take_counters(self) -> Counters:
+        """The counts since this was last asked."""
+        counters, self.counters = self.counters, Counters()
+        return counters
+
     def columns(self, patches: Sequence[int] | NDArray[np.int64], floors: FloatArray | None = None) -> Columns:
         """Form factors from all elements to each of ``patches``.
 
@@ -307,7 +314,10 @@ class ReceiverBundles:
             add_tally(self.counters, tally)
             self.counters.add(rays=traced)
             self.seconds_in_embree += seconds
-        return Columns(chosen, factor, spread)
+        weight = self.mesh.element_area / self.mesh.element_area.sum()
+        square = spread**2
+        by_rays = np.where(rays, square, 0.0) @ weight
+        return Columns(chosen, factor, spread, np.column_stack([square @ weight - by_rays, by_rays]))
 
     def _trace(
         self, patch: int, elements: NDArray[np.int64], counts: NDArray[np.int64], factor: FloatArray, spread: FloatArray

@@ -64,6 +64,7 @@ def solve_direct(
     start = time.perf_counter()
     factor = np.zeros((n, n))
     doubt = np.zeros(n)
+    mean_square = np.zeros((n, 2))
     solution.converged, solution.stopped = False, "interrupted"
     try:
         for first in range(0, n, COLUMNS_A_STEP):
@@ -74,6 +75,7 @@ def solve_direct(
                 columns = bundles.columns(chosen)
             factor[:, chosen] = columns.factor.T
             doubt += columns.spread.sum(axis=0)
+            mean_square[chosen] = columns.mean_square
     except KeyboardInterrupt:
         record.counters.merge(bundles.counters)
         return
@@ -115,6 +117,8 @@ def solve_direct(
         solution.radiosity += mesh.reflectance * arriving
         solution.irradiance += arriving
         solution.unshot[:] = 0.0
+        square = mean_square.T @ solution.radiosity**2
+        solution.state_irradiance_error(form_factors=square[0], visibility=square[1])
         book = solution.book
         shot, received = area @ solution.radiosity, area @ arriving
         book.shot += shot

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radiosity.form_factors.bundle import ReceiverBundles
-from radiosity.solvers.solution import Progress, ProgressEvent, Solution
+from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, ShootingState, Solution
 from workbench.memory import available_bytes
 
 __all__ = ["remaining_bound", "shoot_until"]
@@ -41,6 +41,10 @@ LEAST_ROW_SUM = 0.1
 """A patch of a closed scene that sees less than this is covered, and shoots as it is."""
 CACHE_SHARE = 0.25
 """Share of the free memory that kept form factors may take."""
+CHECKPOINT_SECONDS = 10.0
+"""Least time between checkpoints."""
+CHECKPOINT_SHARE = 0.05
+"""Share of the time that checkpoints may take."""
 
 
 def remaining_bound(solution: Solution) -> float:
@@ -73,24 +77,23 @@ def _receive(solution: Solution, factor: FloatArray, senders: IntArray, sent: Fl
     book.escaped += shot - received
 
 
-def _shoot(solution: Solution, patches: IntArray, factor: FloatArray) -> None:
+def _shoot(solution: Solution, state: ShootingState, patches: IntArray, factor: FloatArray) -> None:
     """Shoot the unshot radiosity of some patches, each as its mean."""
     mesh = solution.mesh
     sent = mesh.patch_mean(solution.unshot)[patches]
+    state.sent[patches] += sent
     for patch in patches:
         solution.unshot[mesh.patch_start[patch] : mesh.patch_start[patch + 1]] = 0.0
     _receive(solution, factor, patches, sent)
 
 
-def _solve_rest(solution: Solution, cache: dict[int, FloatArray]) -> None:
+def _solve_rest(solution: Solution, state: ShootingState, senders: IntArray, factor: FloatArray) -> None:
     """Solve all further bounces at once, from the form factors of every patch that can send.
 
     The total each patch will still shoot, s, obeys ``s = u + M s`` with the unshot radiosity ``u``
     and ``M`` the reflected share of each patch's form factors, all as patch means.
     """
     mesh = solution.mesh
-    senders = np.asarray(sorted(cache))
-    factor = np.stack([cache[patch] for patch in senders.tolist()])
     unshot = mesh.patch_mean(solution.unshot)[senders]
     total = np.empty_like(unshot)
     for band in range(mesh.bands):
@@ -98,6 +101,7 @@ def _solve_rest(solution: Solution, cache: dict[int, FloatArray]) -> None:
         back = np.add.reduceat(factor * weight, mesh.patch_start[:-1], axis=1).T[senders]
         system = np.eye(len(senders)) - back / mesh.patch_area[senders][:, None]
         total[:, band] = np.linalg.solve(system, unshot[:, band])
+    state.sent[senders] += total
     _receive(solution, factor, senders, total)
     # All that arrived has been shot again within ``total``.
     solution.unshot[:] = 0.0
@@ -116,26 +120,56 @@ def _floors(solution: Solution, patches: IntArray, error: float) -> FloatArray:
     return FLOOR_SHARE * error / np.maximum(share, 1e-12)
 
 
+def _columns(
+    solution: Solution, state: ShootingState, bundles: ReceiverBundles, patches: IntArray, room: int
+) -> dict[int, FloatArray]:
+    """Form factors to some patches: those kept, and those found now, which are kept while there is room."""
+    mesh = solution.mesh
+    rows = {p: state.kept[p] for p in patches.tolist() if p in state.kept}
+    missing = np.asarray([p for p in patches.tolist() if p not in rows], dtype=np.int64)
+    if not len(missing):
+        return rows
+    # A patch keeps the care it was given at first: found again, after a break, its form factors are the same.
+    fresh = np.isnan(state.floor[missing])
+    state.floor[missing[fresh]] = _floors(solution, missing[fresh], bundles.settings.error)
+    with solution.record.stage("form factors"):
+        columns = bundles.columns(missing, state.floor[missing])
+    area, patch_area = mesh.element_area, mesh.patch_area[missing]
+    state.row_sum[missing] = columns.factor @ area / patch_area
+    state.doubt[missing] = columns.spread @ area / patch_area
+    state.mean_square[missing] = columns.mean_square
+    for row, patch in enumerate(missing.tolist()):
+        factor = columns.factor[row]
+        if solution.scene.closed and state.row_sum[patch] >= LEAST_ROW_SUM:
+            factor = factor / state.row_sum[patch]  # in an enclosure all that is shot arrives
+        rows[patch] = factor
+        if len(state.kept) < room:
+            state.kept[patch] = factor
+    return rows
+
+
 def shoot_until(
     solution: Solution,
     bundles: ReceiverBundles,
     *,
     tolerance: float,
     progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> None:
     """Shoot a solution's unshot power until :func:`remaining_bound` falls below ``tolerance``.
 
     The solution is changed in place and usable after each step; ``KeyboardInterrupt`` (raised by
-    ``progress`` or by Ctrl-C) ends the work with ``stopped = "interrupted"``.
+    ``progress`` or by Ctrl-C) ends the work with ``stopped = "interrupted"``.  ``checkpoint`` is called with it
+    now and then; gone on from there, or from the interruption, the answer is the same, bit for bit.
     """
     mesh, record = solution.mesh, solution.record
-    start = time.perf_counter()
-    cache: dict[int, FloatArray] = {}
+    start = saved = time.perf_counter()
+    pause = CHECKPOINT_SECONDS
+    if solution.shooting is None:
+        solution.shooting = ShootingState.empty(mesh.patch_count, mesh.bands)
+    state = solution.shooting
     room = int(CACHE_SHARE * available_bytes() / (8 * mesh.element_count))
     can_send = np.maximum.reduceat(mesh.reflectance.max(axis=1), mesh.patch_start[:-1]) > 0
-    sums: list[float] = []
-    doubts: list[float] = []
-    known: set[int] = set()
     solution.converged, solution.stopped = False, "interrupted"
     try:
         while True:
@@ -143,18 +177,21 @@ def shoot_until(
             if progress is not None:
                 seconds = time.perf_counter() - start
                 progress(ProgressEvent(record.counters["shots"], residual, tolerance, seconds, "shooting"))
+            if checkpoint is not None and time.perf_counter() - saved > pause:
+                _report(solution, bundles, state)
+                began = time.perf_counter()
+                checkpoint(solution)
+                saved = time.perf_counter()
+                pause = max(CHECKPOINT_SECONDS, (saved - began) / CHECKPOINT_SHARE)
             if residual <= tolerance:
                 solution.converged, solution.stopped = True, "tolerance"
                 break
             power = np.abs(mesh.patch_mean(solution.unshot)).sum(axis=1) * mesh.patch_area
-            waiting = can_send | (power > 0)
-            if (
-                len(cache)
-                and waiting.sum() <= min(len(cache), SOLVE_LIMIT)
-                and all(int(p) in cache for p in np.flatnonzero(waiting))
-            ):
+            waiting = np.flatnonzero(can_send | (power > 0))
+            if 0 < len(waiting) <= min(room, SOLVE_LIMIT) and not np.isnan(state.floor[waiting]).any():
+                rows = _columns(solution, state, bundles, waiting, room)
                 with record.stage("solve"):
-                    _solve_rest(solution, cache)
+                    _solve_rest(solution, state, waiting, np.stack([rows[p] for p in waiting.tolist()]))
                 solution.converged, solution.stopped = True, "solved"
                 break
             # Strongest first; ties by number, so that the order is the same everywhere.
@@ -163,57 +200,45 @@ def shoot_until(
             if not power[batch[0]] > 0:
                 solution.converged, solution.stopped = True, "tolerance"
                 break
-            fresh = np.asarray([p for p in batch.tolist() if p not in cache], dtype=np.int64)
-            rows = {p: cache[p] for p in batch.tolist() if p in cache}
-            if len(fresh):
-                with record.stage("form factors"):
-                    columns = bundles.columns(fresh, _floors(solution, fresh, bundles.settings.error))
-                for row, patch in enumerate(fresh.tolist()):
-                    factor = columns.factor[row]
-                    row_sum = float(factor @ mesh.element_area / mesh.patch_area[patch])
-                    if patch not in known:
-                        known.add(patch)
-                        sums.append(row_sum)
-                        doubts.append(float(columns.spread[row] @ mesh.element_area / mesh.patch_area[patch]))
-                    if solution.scene.closed and row_sum >= LEAST_ROW_SUM:
-                        factor = factor / row_sum  # in an enclosure all that is shot arrives
-                    rows[patch] = factor
-                    if len(cache) < room:
-                        cache[patch] = factor
+            rows = _columns(solution, state, bundles, batch, room)
             with record.stage("shoot"):
-                _shoot(solution, batch, np.stack([rows[p] for p in batch.tolist()]))
+                _shoot(solution, state, batch, np.stack([rows[p] for p in batch.tolist()]))
             record.counters.add(shots=len(batch))
     except KeyboardInterrupt:
         pass
     finally:
-        _report(solution, bundles, cache, np.asarray(sums), np.asarray(doubts))
+        _report(solution, bundles, state)
 
 
-def _report(
-    solution: Solution,
-    bundles: ReceiverBundles,
-    cache: dict[int, FloatArray],
-    sums: FloatArray,
-    doubts: FloatArray,
-) -> None:
+def _report(solution: Solution, bundles: ReceiverBundles, state: ShootingState) -> None:
     """Put what the run knows of its own errors into the record."""
     mesh, record = solution.mesh, solution.record
-    record.counters.merge(bundles.counters)
-    record.seconds["inside embree, summed over threads"] = bundles.seconds_in_embree
+    record.counters.merge(bundles.take_counters())
+    inside = "inside embree, summed over threads"
+    record.seconds[inside] = record.seconds.get(inside, 0.0) + bundles.seconds_in_embree
+    bundles.seconds_in_embree = 0.0
     record.errors["remaining_bound"] = remaining_bound(solution)
     record.errors["energy_imbalance"] = solution.book.imbalance(solution.unshot_power)
-    if len(sums):
+    known = np.flatnonzero(~np.isnan(state.floor))
+    if len(known):
+        sums = state.row_sum[known]
         record.errors["row_sum"] = {
             "min": float(sums.min()),
             "mean": float(sums.mean()),
             "max": float(sums.max()),
-            "stated_error": float(doubts.max()),
-            "rows": len(sums),
+            "stated_error": float(state.doubt[known].max()),
+            "rows": len(known),
         }
-    if len(cache) > 1:
-        patches = np.asarray(sorted(cache))
+        # Errors of different senders are independent: their squares add.
+        square = state.mean_square[known].T @ state.sent[known] ** 2
+        solution.state_irradiance_error(form_factors=square[0], visibility=square[1])
+    if len(state.kept) > 1:
+        patches = np.asarray(sorted(state.kept))
         exchange = np.stack(
-            [np.add.reduceat(cache[p] * mesh.element_area, mesh.patch_start[:-1])[patches] for p in patches.tolist()]
+            [
+                np.add.reduceat(state.kept[p] * mesh.element_area, mesh.patch_start[:-1])[patches]
+                for p in patches.tolist()
+            ]
         )
         scale = max(float(exchange.max()), 1e-300)
         record.errors["reciprocity"] = float(np.abs(exchange - exchange.T).max() / scale)

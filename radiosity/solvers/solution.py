@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from workbench.scene.model import Scene
 if TYPE_CHECKING:
     import pyvista
 
-__all__ = ["EnergyBook", "ProgressEvent", "Solution"]
+__all__ = ["Checkpoint", "EnergyBook", "Progress", "ProgressEvent", "ShootingState", "Solution"]
 
 FloatArray = NDArray[np.float64]
 
@@ -44,6 +45,10 @@ class ProgressEvent:
 
 
 Progress = Callable[[ProgressEvent], None]
+Checkpoint = Callable[["Solution"], None]
+
+KEPT_LIMIT = 256 * 2**20
+"""Most bytes of kept form factors that are saved with a solution that is not finished."""
 
 
 @dataclass
@@ -77,6 +82,62 @@ class EnergyBook:
         return {f"{f.name}_W": getattr(self, f.name).tolist() for f in dataclasses.fields(self)}
 
 
+@dataclass
+class ShootingState:
+    """What progressive refinement knows beside the solution, so that it can go on after a break.
+
+    Parameters
+    ----------
+    floor : (q,) float
+        Absolute error below which each patch's form factors were not refined; NaN: none found yet.
+    row_sum, doubt : (q,) float
+        Row sum of each patch as found, and its stated error.
+    mean_square : (q, 2) float
+        Area-weighted mean squared error of the form factors to each patch, by formula and by rays.
+    sent : (q, bands) float
+        Radiosity that each patch has shot. [W m-2]
+    kept : dict
+        Form factors (n,) from all elements to a patch.
+    """
+
+    floor: FloatArray
+    row_sum: FloatArray
+    doubt: FloatArray
+    mean_square: FloatArray
+    sent: FloatArray
+    kept: dict[int, FloatArray] = field(default_factory=dict)
+
+    @classmethod
+    def empty(cls, patches: int, bands: int) -> ShootingState:
+        """Nothing found, nothing shot."""
+        unknown = np.full(patches, np.nan)
+        return cls(unknown, unknown.copy(), unknown.copy(), np.zeros((patches, 2)), np.zeros((patches, bands)))
+
+    def copy(self) -> ShootingState:
+        """An independent copy; the kept form factors, which never change, are shared."""
+        arrays = (self.floor, self.row_sum, self.doubt, self.mean_square, self.sent)
+        return ShootingState(*(array.copy() for array in arrays), dict(self.kept))
+
+    def as_arrays(self, *, with_kept: bool) -> dict[str, NDArray]:
+        """Arrays by name, for a file."""
+        arrays: dict[str, NDArray] = {name: getattr(self, name) for name in _SHOOTING_ARRAYS}
+        if with_kept and 0 < sum(row.nbytes for row in self.kept.values()) <= KEPT_LIMIT:
+            arrays["kept_patches"] = np.asarray(sorted(self.kept), dtype=np.int64)
+            arrays["kept_factors"] = np.stack([self.kept[p] for p in sorted(self.kept)])
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray]) -> ShootingState:
+        """The inverse of :meth:`as_arrays`."""
+        state = cls(*(arrays[name] for name in _SHOOTING_ARRAYS))
+        if "kept_patches" in arrays:
+            state.kept = dict(zip(arrays["kept_patches"].tolist(), arrays["kept_factors"], strict=True))
+        return state
+
+
+_SHOOTING_ARRAYS = ("floor", "row_sum", "doubt", "mean_square", "sent")
+
+
 def _column(values: NDArray) -> NDArray:
     """Values as VTK takes them: one band as a plain array."""
     return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
@@ -101,6 +162,10 @@ class Solution:
     converged : bool
     stopped : str
         Why the solver stopped: ``tolerance``, ``solved``, ``interrupted``.
+    direct_irradiance : (n, bands) float
+        Flux per area from lights without surface and from the background. [W m-2]
+    shooting : ShootingState, optional
+        Progressive refinement's own state.
     """
 
     scene: Scene
@@ -113,11 +178,28 @@ class Solution:
     converged: bool = False
     stopped: str = ""
     direct_irradiance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    shooting: ShootingState | None = None
 
     @property
     def unshot_power(self) -> FloatArray:
         """Power still to be shot, (bands,). [W]"""
         return self.mesh.element_area @ self.unshot
+
+    @property
+    def mean_irradiance(self) -> FloatArray:
+        """Area-weighted mean irradiance, (bands,). [W m-2]"""
+        area = self.mesh.element_area
+        return (area @ self.irradiance) / area.sum()
+
+    def state_irradiance_error(self, **mean_squares: FloatArray) -> None:
+        """Put named errors of the irradiance into the record, each given by its mean square (bands,).
+
+        Stated as root mean square over area and bands, relative to the mean irradiance.
+        """
+        mean = float(self.mean_irradiance.mean())
+        for name, square in mean_squares.items():
+            value = math.sqrt(float(np.mean(square)))
+            self.record.errors[f"irradiance_{name}_rms"] = value / mean if mean > 0 else 0.0
 
     def vertex_radiosity(self) -> FloatArray:
         """Radiosity interpolated to the corners of the mesh's pieces, (k, bands). [W m-2]"""
@@ -157,6 +239,18 @@ class Solution:
         """Write ``solution.npz``, ``solution.vtp`` and ``record.json``, each whole or not at all."""
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
+        self.save_state(directory)
+        vtp = directory / f".solution.{os.getpid()}.part.vtp"
+        try:
+            self.to_pyvista().save(vtp)
+            vtp.replace(directory / "solution.vtp")
+        finally:
+            vtp.unlink(missing_ok=True)
+        self.record.write(directory / "record.json")
+
+    def save_state(self, directory: str | Path) -> None:
+        """Write ``solution.npz`` alone, whole or not at all: all that ``resume`` needs."""
+        directory = Path(directory)
         arrays = {f"mesh_{f.name}": getattr(self.mesh, f.name) for f in dataclasses.fields(self.mesh)}
         state = {
             "converged": self.converged,
@@ -165,8 +259,10 @@ class Solution:
             "record": self.record.as_dict(),
         }
         arrays |= {f"book_{k}": getattr(self.book, k) for k in ("emitted", "shot", "received", "absorbed", "escaped")}
+        if self.shooting is not None:
+            stored = self.shooting.as_arrays(with_kept=not self.converged)
+            arrays |= {f"shooting_{name}": values for name, values in stored.items()}
         beside = directory / f".solution.{os.getpid()}.part.npz"
-        vtp = directory / f".solution.{os.getpid()}.part.vtp"
         try:
             np.savez(
                 beside,
@@ -177,13 +273,9 @@ class Solution:
                 state=json.dumps(state, default=float),
                 **arrays,
             )
-            self.to_pyvista().save(vtp)
             beside.replace(directory / "solution.npz")
-            vtp.replace(directory / "solution.vtp")
         finally:
             beside.unlink(missing_ok=True)
-            vtp.unlink(missing_ok=True)
-        self.record.write(directory / "record.json")
 
     @classmethod
     def load(cls, directory: str | Path) -> Solution:
@@ -209,6 +301,9 @@ class Solution:
             names = ("emitted", "shot", "received", "absorbed", "escaped")
             book = EnergyBook(*(arrays[f"book_{k}"] for k in names))
             values = [arrays[k] for k in ("radiosity_W_m2", "irradiance_W_m2", "unshot_W_m2", "direct_irradiance_W_m2")]
+            prefix = "shooting_"
+            stored = {name[len(prefix) :]: array for name, array in arrays.items() if name.startswith(prefix)}
+            shooting = ShootingState.from_arrays(stored) if stored else None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path}: found no readable solution ({error}); solve the scene again") from None
         stored_record = state["record"]
@@ -232,4 +327,5 @@ class Solution:
             converged=bool(state["converged"]),
             stopped=str(state["stopped"]),
             direct_irradiance=values[3],
+            shooting=shooting,
         )

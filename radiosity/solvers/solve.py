@@ -14,7 +14,7 @@ from radiosity.patches import PatchMesh, build_mesh, forecast_elements
 from radiosity.solvers.direct import solve_direct
 from radiosity.solvers.incident import incident_irradiance
 from radiosity.solvers.progressive import shoot_until
-from radiosity.solvers.solution import EnergyBook, Progress, Solution
+from radiosity.solvers.solution import Checkpoint, EnergyBook, Progress, Solution
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.memory import require_memory
@@ -145,6 +145,7 @@ def _resumed(scene: Scene, mesh: PatchMesh, previous: Solution, record: RunRecor
         book=copy.deepcopy(previous.book),
         record=record,
         direct_irradiance=previous.direct_irradiance,
+        shooting=previous.shooting.copy() if previous.shooting is not None else None,
     )
 
 
@@ -160,6 +161,7 @@ def solve(
     workers: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
     resume: Solution | None = None,
 ) -> Solution:
     """Solve a scene for radiosity.
@@ -187,6 +189,8 @@ def solve(
         Of the rays.
     progress : callable, optional
         Called with a :class:`ProgressEvent` at every step.
+    checkpoint : callable, optional
+        Called now and then with the unfinished solution, for instance to save it.
     resume : Solution, optional
         An earlier solution of the same scene and mesh to go on from.
 
@@ -261,7 +265,7 @@ def solve(
         if method == "direct":
             solve_direct(solution, bundles, closed=scene.closed, progress=progress)
         else:
-            shoot_until(solution, bundles, tolerance=tolerance, progress=progress)
+            shoot_until(solution, bundles, tolerance=tolerance, progress=progress, checkpoint=checkpoint)
     finally:
         bundles.close()
     record.errors["facet_error"] = mesh.facet_error

@@ -10,6 +10,7 @@ import pytest
 from radiosity_scenes import UNIT, cube_with_emitter, polygon_scene, standing_box
 
 import radiosity
+import radiosity.solvers.solution as solution_module
 from radiosity.form_factors.bundle import LinkSettings, ReceiverBundles
 from radiosity.patches import build_mesh
 from radiosity.solvers import progressive
@@ -230,24 +231,54 @@ def test_ctrl_c_leaves_a_usable_solution_that_resumes_to_the_same(monkeypatch):
     before = part.radiosity.copy(), part.book.shot.copy()
     resumed = radiosity.solve(scene, **options, resume=part)
     assert resumed.converged
-    # Form factors are found again, some to another floor: equal to their error, not bit for bit.
-    assert np.allclose(resumed.radiosity, whole.radiosity, rtol=1e-5)
-    assert np.allclose(resumed.book.shot, whole.book.shot, rtol=1e-5)
-    assert abs(resumed.record.counters["shots"] - whole.record.counters["shots"]) <= 8
+    assert (resumed.radiosity == whole.radiosity).all()
+    assert (resumed.book.shot == whole.book.shot).all()
+    assert resumed.record.counters["shots"] == whole.record.counters["shots"]
     # The interrupted solution is still what it was.
     assert (part.radiosity == before[0]).all() and (part.book.shot == before[1]).all()
 
 
-def test_resume_through_a_file(tmp_path):
+@pytest.mark.parametrize("kept", [True, False])
+def test_resume_through_a_file(tmp_path, monkeypatch, kept):
+    monkeypatch.setattr(solution_module, "KEPT_LIMIT", 2**28 if kept else 0)
     scene = cube_with_emitter(0.3, 0.6)
     options = {"method": "progressive", "elements": 100, "workers": 1, "tolerance": 1e-5}
     part = radiosity.solve(scene, **options, progress=Stop(2))
     part.save(tmp_path / "out")
     loaded = radiosity.Solution.load(tmp_path / "out")
+    assert (loaded.shooting is not None) and bool(loaded.shooting.kept) == kept
     resumed = radiosity.solve(scene, **options, resume=loaded)
     whole = radiosity.solve(scene, **options)
-    assert np.allclose(resumed.radiosity, whole.radiosity, rtol=1e-4)
+    # Form factors that were not kept are found again with the same care: the same bits.
+    assert (resumed.radiosity == whole.radiosity).all()
     assert resumed.book.imbalance(resumed.unshot_power) < 1e-12
+
+
+def test_a_killed_solve_resumes_from_its_checkpoint_to_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(progressive, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(progressive, "CHECKPOINT_SHARE", np.inf)
+
+    class KilledError(Exception):
+        pass
+
+    calls = []
+
+    def die_after_saving(unfinished):
+        unfinished.save_state(tmp_path)
+        calls.append(unfinished.record.counters["links"])
+        if len(calls) == 3:
+            raise KilledError
+
+    scene = cube_with_emitter(0.3, 0.6)
+    options = {"method": "progressive", "elements": 100, "workers": 1, "tolerance": 1e-5}
+    whole = radiosity.solve(scene, **options)
+    with pytest.raises(KilledError):
+        radiosity.solve(scene, **options, checkpoint=die_after_saving)
+    assert calls[0] < calls[2]
+    resumed = radiosity.solve(scene, **options, resume=radiosity.Solution.load(tmp_path))
+    assert (resumed.radiosity == whole.radiosity).all() and (resumed.book.shot == whole.book.shot).all()
+    for name in ("shots", "links", "closed_forms"):
+        assert resumed.record.counters[name] == whole.record.counters[name]
 
 
 def test_resume_refuses_another_mesh():
