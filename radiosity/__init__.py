@@ -15,13 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from radiosity.patches import PatchMesh
+    from radiosity.sensors import Gatherer, IrradianceEstimate
     from radiosity.solvers.solution import ProgressEvent, Solution
     from radiosity.solvers.solve import solve
     from radiosity.view import render_preview
 
-__all__ = ["PatchMesh", "ProgressEvent", "Solution", "render_preview", "solve"]
+__all__ = ["Gatherer", "IrradianceEstimate", "PatchMesh", "ProgressEvent", "Solution", "render_preview", "solve"]
 
 _HOME = {
+    "Gatherer": "radiosity.sensors",
+    "IrradianceEstimate": "radiosity.sensors",
     "PatchMesh": "radiosity.patches",
     "ProgressEvent": "radiosity.solvers.solution",
     "Solution": "radiosity.solvers.solution",

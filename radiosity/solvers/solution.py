@@ -23,6 +23,9 @@ from workbench.scene.model import Scene
 
 if TYPE_CHECKING:
     import pyvista
+    from numpy.typing import ArrayLike
+
+    from radiosity.sensors import IrradianceEstimate
 
 __all__ = ["Checkpoint", "EnergyBook", "Progress", "ProgressEvent", "ShootingState", "Solution"]
 
@@ -204,6 +207,27 @@ class Solution:
     def vertex_radiosity(self) -> FloatArray:
         """Radiosity interpolated to the corners of the mesh's pieces, (k, bands). [W m-2]"""
         return corner_values(self.mesh, self.radiosity)
+
+    def irradiance_at(
+        self,
+        points: ArrayLike,
+        normals: ArrayLike,
+        *,
+        error: float = 0.01,
+        own_polygon: ArrayLike | None = None,
+        rays: int | None = None,
+        workers: int | None = None,
+        seed: int = 0,
+    ) -> IrradianceEstimate:
+        """Irradiance at any points: direct light found afresh, indirect light gathered from this solution.
+
+        Arguments as in :meth:`radiosity.sensors.Gatherer.irradiance`; for several questions make a
+        ``Gatherer`` once.
+        """
+        from radiosity.sensors import Gatherer
+
+        gatherer = Gatherer(self, workers=workers, seed=seed)
+        return gatherer.irradiance(points, normals, own_polygon=own_polygon, error=error, rays=rays)
 
     def to_pyvista(self) -> pyvista.PolyData:
         """The mesh with its arrays, for pyvista.

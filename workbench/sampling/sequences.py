@@ -19,7 +19,6 @@ import math
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import qmc
 
 from workbench.errors import InputError
 
@@ -138,6 +137,8 @@ def sobol_bits(count: int) -> NDArray[np.uint32]:
 
     Source: scipy.stats.qmc (direction numbers of S. Joe and F. Y. Kuo, 2008).
     """
+    from scipy.stats import qmc  # half a second of import, for this alone
+
     _checked(count, 0)
     plain = qmc.Sobol(2, scramble=False, bits=32).random_base2(max(count - 1, 0).bit_length())
     return (plain[:count] * 2.0**32).astype(np.uint32)

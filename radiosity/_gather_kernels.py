@@ -1,0 +1,135 @@
+"""Hemisphere bundles as kernels: cosine-equal rays from points, and what their hits send back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from radiosity.element_lookup import search_list
+from workbench.sampling.sequences import hashed, owen_scramble
+
+RUNS = 4
+"""Blocks of one point's rays that are told apart: each is a net of its own, their spread tells the error."""
+
+
+@njit(nogil=True, cache=True)
+def net_bits(count):
+    """The first ``count`` points of the Sobol sequence in two dimensions, as 32-bit binary fractions.
+
+    Any aligned block of a power of two of them is a (0, m, 2)-net.  The first coordinate is the
+    reversed index (van der Corput), the second comes from the Pascal matrix (I. M. Sobol, 1967).
+    """
+    out = np.zeros((count, 2), dtype=np.uint32)
+    for k in range(count):
+        x = y = np.uint32(0)
+        direction = np.uint32(0x80000000)
+        place = np.uint32(0x80000000)
+        rest = k
+        while rest:
+            if rest & 1:
+                x ^= place
+                y ^= direction
+            rest >>= 1
+            place >>= np.uint32(1)
+            direction ^= direction >> np.uint32(1)
+        out[k, 0], out[k, 1] = x, y
+    return out
+
+
+@njit(nogil=True, cache=True)
+def gather_rays(
+    points, normals, rows, bits, first, last, count, seed, offset, centre, scale, origins, directions, owner, run,
+):  # fmt: skip
+    """Rays ``first..last`` of the ``count`` in the bundle of each of ``rows``, in Embree's unit coordinates.
+
+    Directions are unit vectors as dense as the cosine to the normal: a scrambled net of the unit
+    square, of each point's own by its number and ``seed``, on the disk (Shirley and Chiu 1997) lifted
+    to the hemisphere (Malley).  ``owner`` gets the position in ``rows`` of each ray, ``run`` its block.
+    """
+    k = 0
+    for position in range(rows.shape[0]):
+        i = rows[position]
+        h = hashed(i, seed)
+        s0, s1 = np.uint32(h & np.uint64(0xFFFFFFFF)), np.uint32(h >> np.uint64(32))
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        # A frame about the normal without a branch at the pole (Duff et al., JCGT 6(1), 2017).
+        sign = math.copysign(1.0, nz)
+        a = -1.0 / (sign + nz)
+        b = nx * ny * a
+        px, py, pz = 1.0 + sign * nx * nx * a, sign * b, -sign * nx
+        qx, qy, qz = b, sign + ny * ny * a, -ny
+        ox = (points[i, 0] + offset * nx - centre[0]) * scale
+        oy = (points[i, 1] + offset * ny - centre[1]) * scale
+        oz = (points[i, 2] + offset * nz - centre[2]) * scale
+        for j in range(first, last):
+            u = 2.0 * ((np.float64(owen_scramble(bits[j, 0], s0)) + 0.5) * 2.0**-32) - 1.0
+            v = 2.0 * ((np.float64(owen_scramble(bits[j, 1], s1)) + 0.5) * 2.0**-32) - 1.0
+            if abs(u) > abs(v):
+                radius, angle = u, 0.25 * math.pi * (v / u)
+            else:
+                radius, angle = v, 0.5 * math.pi - 0.25 * math.pi * (u / v)
+            x, y = radius * math.cos(angle), radius * math.sin(angle)
+            z = math.sqrt(max(1.0 - radius * radius, 0.0))
+            origins[k, 0], origins[k, 1], origins[k, 2] = ox, oy, oz
+            directions[k, 0] = x * px + y * qx + z * nx
+            directions[k, 1] = x * py + y * qy + z * ny
+            directions[k, 2] = x * pz + y * qz + z * nz
+            owner[k], run[k] = position, j * RUNS // count
+            k += 1
+
+
+@njit(nogil=True, cache=True)
+def collect_hits(
+    origins, directions, owner, run, weight, polygon, measure, centre, scale, polygon_normal, polygon_level, through,
+    root, frame, counts, cells, lists, order, boxes, links, starts, edges, piece_element, linear, sums, reach, passed,
+):  # fmt: skip
+    """Add what the hits of rays send back to ``sums`` (points, runs, bands); the number of rays past a pane.
+
+    ``linear`` (elements, bands, 4) gives the radiosity at (x, y, z) as ``a x + b y + c z + d``.
+    ``reach`` (points, 2) gets the sum of 1 / distance and the number of hits, if ``measure``.
+    ``passed`` gets the position, the weight and the distance of rays that go on through a pane.
+    """
+    many = 0
+    bands = linear.shape[1]
+    for k in range(polygon.shape[0]):
+        p = polygon[k]
+        if p < 0:
+            continue
+        dx, dy, dz = np.float64(directions[k, 0]), np.float64(directions[k, 1]), np.float64(directions[k, 2])
+        ox = np.float64(origins[k, 0]) / scale + centre[0]
+        oy = np.float64(origins[k, 1]) / scale + centre[1]
+        oz = np.float64(origins[k, 2]) / scale + centre[2]
+        facing = polygon_normal[p, 0] * dx + polygon_normal[p, 1] * dy + polygon_normal[p, 2] * dz
+        if facing == 0.0:
+            continue
+        height = polygon_level[p] - (polygon_normal[p, 0] * ox + polygon_normal[p, 1] * oy + polygon_normal[p, 2] * oz)
+        t = max(height / facing, 0.0)
+        position = owner[k]
+        if measure:
+            reach[position, 0] += weight[k] / max(t, 1e-300)
+            reach[position, 1] += weight[k]
+        if through[p] > 0.0:
+            passed[many, 0], passed[many, 1], passed[many, 2] = k, weight[k] * through[p], t
+            many += 1
+        group = root[p, 0 if facing < 0.0 else 1]
+        if group == -1:
+            continue
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        if group <= -2:
+            e = -2 - group
+        else:
+            # The look-up's grid, written out: a call would cost more.
+            u = frame[group, 0] * x + frame[group, 1] * y + frame[group, 2] * z - frame[group, 3]
+            v = frame[group, 4] * x + frame[group, 5] * y + frame[group, 6] * z - frame[group, 7]
+            column = min(max(int(u), 0), counts[group, 1] - 1)
+            row = min(max(int(v), 0), counts[group, 2] - 1)
+            piece = cells[counts[group, 0] + row * counts[group, 1] + column]
+            if piece < 0:
+                piece = search_list(x, y, z, -1 - piece, lists, order, boxes, links, starts, edges)
+            e = piece_element[piece]
+        for band in range(bands):
+            value = linear[e, band, 0] * x + linear[e, band, 1] * y + linear[e, band, 2] * z + linear[e, band, 3]
+            sums[position, run[k], band] += weight[k] * max(value, 0.0)
+    return many

@@ -1,0 +1,167 @@
+"""Irradiance at points: exact direct light, gathered indirect light, honest errors, the same for any workers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radiosity_scenes import cube_with_emitter
+
+import radiosity
+import workbench
+from radiosity.sensors import Gatherer
+from workbench.errors import InputError, OptionError
+from workbench.scene.library import box_surface, diffuse, unit_cube
+from workbench.scene.model import Scene, Surface
+
+
+@pytest.fixture(scope="module")
+def cornell():
+    """The Cornell box, coarsely solved, and sensors on its surfaces and in its air."""
+    solution = radiosity.solve(workbench.load("cornell-box"), elements=400, tolerance=0.02, workers=1)
+    mesh = solution.mesh
+    rng = np.random.default_rng(5)
+    element = rng.choice(mesh.element_count, 60, p=mesh.element_area / mesh.element_area.sum())
+    air = rng.uniform([0.05, 0.35, 0.05], [0.5, 0.5, 0.5], (20, 3))
+    normal = rng.normal(size=(20, 3))
+    points = np.concatenate([mesh.element_centroid[element], air])
+    normals = np.concatenate([mesh.element_normal[element], normal / np.linalg.norm(normal, axis=1)[:, None]])
+    own = np.concatenate([mesh.element_polygon[element], np.full(20, -1)])
+    return solution, points, normals, own
+
+
+def test_furnace_is_constant_at_every_point():
+    # With radiosity 1 / (1 - rho) = 2 all round, a closed furnace gives E = 2 anywhere in any direction.
+    solution = radiosity.solve(unit_cube(0.5, 1.0), elements=24, tolerance=1e-6, workers=1)
+    rng = np.random.default_rng(0)
+    points, normals = rng.uniform(0.02, 0.98, (50, 3)), rng.normal(size=(50, 3))
+    found = solution.irradiance_at(points, normals, workers=1)
+    assert np.abs(found.irradiance / 2.0 - 1).max() < 1e-4
+    assert np.abs(found.direct - 1.0).max() < 1e-6  # the emission itself, in closed form
+
+
+def test_black_scene_has_direct_light_only():
+    scene = cube_with_emitter(0.0, 0.0)
+    solution = radiosity.solve(scene, elements=24, workers=1)
+    found = solution.irradiance_at([[0.5, 0.5, 0.5]], [[0, 0, -1]], workers=1)
+    assert found.method == "none" and not found.indirect.any()
+    # Lambert over the unit square from half its side above the middle: 0.5541264 (the hemicube's top).
+    assert found.irradiance[0, 0] == pytest.approx(0.55412642398, abs=1e-9)
+
+
+def test_bundles_tell_their_error(cornell):
+    solution, points, normals, own = cornell
+    gatherer = Gatherer(solution, workers=1)
+    truth = np.mean(
+        [Gatherer(solution, workers=1, seed=s).irradiance(points, normals, own_polygon=own, rays=4096).indirect
+         for s in (11, 12, 13)], axis=0,
+    )  # fmt: skip
+    for rays in (32, 256):
+        found = gatherer.irradiance(points, normals, own_polygon=own, rays=rays)
+        z = (found.indirect - truth) / found.standard_error
+        assert 0.5 < np.sqrt((z**2).mean()) < 1.4
+        assert np.mean(np.abs(z) > 3) < 0.03
+
+
+def test_asked_error_is_kept_and_rays_grow_with_it(cornell):
+    solution, points, normals, own = cornell
+    gatherer = Gatherer(solution, workers=1)
+    truth = gatherer.irradiance(points, normals, own_polygon=own, rays=8192)
+    before = 0
+    for error in (0.05, 0.01, 0.003):
+        found = Gatherer(solution, workers=1, seed=3).irradiance(points, normals, own_polygon=own, error=error)
+        off = np.sqrt(((found.irradiance - truth.irradiance) ** 2).mean(axis=0)) / truth.irradiance.mean(axis=0)
+        assert off.max() < 1.2 * error
+        assert found.counters["rays"] > before
+        before = found.counters["rays"]
+
+
+def test_answer_does_not_depend_on_workers(cornell):
+    solution, points, normals, own = cornell
+    one = Gatherer(solution, workers=1).irradiance(points, normals, own_polygon=own, rays=512)
+    four = Gatherer(solution, workers=4).irradiance(points, normals, own_polygon=own, rays=512)
+    assert np.array_equal(one.irradiance, four.irradiance)
+    assert np.array_equal(one.standard_error, four.standard_error)
+
+
+def test_distance_is_the_harmonic_mean():
+    # From the middle of a sphere-like cube of side 2: between 1 (faces) and sqrt 3 (corners).
+    solution = radiosity.solve(unit_cube(0.5, 1.0), elements=6, workers=1)
+    found = solution.irradiance_at([[0.5, 0.5, 0.5], [0.5, 0.5, 0.01]], [[0, 0, 1], [1, 0, 0]], workers=1, rays=256)
+    assert 0.5 < found.distance[0] < 0.5 * np.sqrt(3)
+    assert found.distance[1] < 0.1  # close above the floor
+
+
+def test_panes_dim_what_lies_behind_them():
+    # A black lid that emits above a pane of transmittance 0.3, above a grey floor: the pane dims direct light, and
+    # indirect light on its way up and down.
+    def room(transmittance):
+        pane = diffuse("pane", 0.0)
+        pane = type(pane)(**{**pane.__dict__, "transmittance": np.array([transmittance]), "two_sided": True})
+        square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        surfaces = (
+            Surface.from_polygons("lamp", diffuse("lamp", 0.0, 1.0), [square[::-1] + [0, 0, 1]]),
+            Surface.from_polygons("floor", diffuse("floor", 0.5), [square]),
+            Surface.from_polygons("pane", pane, [square + [0, 0, 0.5]]),
+        )
+        return Scene("pane", surfaces, bands=1)
+
+    solution = radiosity.solve(room(0.3), elements=3, workers=1)
+    points, normals = np.array([[0.5, 0.5, 0.9], [0.5, 0.5, 0.01]]), np.array([[0, 0, -1.0], [0, 0, 1.0]])
+    found = solution.irradiance_at(points, normals, workers=1, rays=4096)
+    from radiosity.form_factors.analytic import point_to_polygon
+
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    floor = solution.radiosity[solution.mesh.element_surface == 1][0, 0]
+    seen_whole = point_to_polygon(points[:1], normals[:1], square)[0]
+    seen_by_pane = point_to_polygon(points[:1], normals[:1], square + [0, 0, 0.5])[0]
+    # Every line from the point to the floor goes through the pane, for the pane covers the floor.
+    assert seen_by_pane > seen_whole
+    assert found.indirect[0, 0] == pytest.approx(0.3 * floor * seen_whole, rel=0.01)
+    assert found.direct[1, 0] == pytest.approx(0.3 * point_to_polygon(points[1:], normals[1:], square + [0, 0, 1])[0])
+
+
+def test_the_back_of_a_one_sided_surface_is_black_and_blocks():
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    lamp = Surface.from_polygons("lamp", diffuse("lamp", 0.0, 1.0), [square[::-1] + [0, 0, 2.0]])
+    floor = Surface.from_polygons("floor", diffuse("floor", 0.5), [square])
+    shelf = Surface.from_polygons("shelf", diffuse("shelf", 0.9), [square + [0, 0, 1.0]])
+    solution = radiosity.solve(Scene("shelf", (lamp, floor, shelf), bands=1), elements=30, workers=1)
+    below = solution.irradiance_at([[0.5, 0.5, 0.9]], [[0, 0, 1]], workers=1, rays=256)
+    above = solution.irradiance_at([[0.5, 0.5, 1.9]], [[0, 0, -1]], workers=1, rays=256)
+    assert below.irradiance[0, 0] == 0.0
+    assert above.indirect[0, 0] > 0.0
+
+
+def test_emission_of_a_mesh_of_many_facets_is_counted_once():
+    # A lamp of 200 facets is gathered, not asked facet by facet; it must equal one polygon of the same shape.
+    square = np.array([[0.2, 0.2, 1.0], [0.2, 0.8, 1.0], [0.8, 0.8, 1.0], [0.8, 0.2, 1.0]])
+    steps = np.linspace(0.2, 0.8, 11)
+    quads = [
+        np.array([[a, c, 1.0], [a, d, 1.0], [b, d, 1.0], [b, c, 1.0]])
+        for a, b in zip(steps, steps[1:], strict=False)
+        for c, d in zip(steps, steps[1:], strict=False)
+    ]
+    lamp = diffuse("lamp", 0.0, 1.0)
+    room = box_surface("room", diffuse("wall", 0.5), [0, 0, 0], [1, 1, 1], inward=True, omit=["+z"])
+    one = Scene("one", (room, Surface.from_polygons("lamp", lamp, [square])), bands=1)
+    many = Scene("many", (room, Surface.from_polygons("lamp", lamp, quads)), bands=1)
+    point, normal = [[0.5, 0.5, 0.0]], [[0, 0, 1]]
+    values = []
+    for scene in (one, many):
+        solution = radiosity.solve(scene, elements=300, workers=1, tolerance=1e-3)
+        values.append(solution.irradiance_at(point, normal, own_polygon=0, workers=1, rays=4096))
+    assert not values[1].direct.any()
+    assert values[1].irradiance[0, 0] == pytest.approx(values[0].irradiance[0, 0], rel=0.01)
+
+
+def test_bad_questions_are_refused(cornell):
+    solution = cornell[0]
+    gatherer = Gatherer(solution, workers=1)
+    with pytest.raises(InputError, match="points: found none"):
+        gatherer.irradiance(np.empty((0, 3)), np.empty((0, 3)))
+    with pytest.raises(InputError, match="normals: found 2 rows for 3 points"):
+        gatherer.irradiance(np.zeros((3, 3)), np.ones((2, 3)))
+    with pytest.raises(OptionError, match="error: found 0"):
+        gatherer.irradiance([[0, 0, 0]], [[0, 0, 1]], error=0)
+    with pytest.raises(OptionError, match="rays: found 0"):
+        gatherer.irradiance([[0, 0, 0]], [[0, 0, 1]], rays=0)
