@@ -522,9 +522,10 @@ def render(
     counts = record.counters
     lines = [
         f"{loaded.name}: {drawn.pixels.shape[1]} x {drawn.pixels.shape[0]}, "
-        f"{record.results['samples_per_pixel']:.3g} samples a pixel, {counts['rays']:,} rays "
-        f"({counts['cast_rays']:,} cast, {counts['shadow_rays']:,} shadow, {counts['reflection_rays']:,} reflected, "
-        f"{counts['refraction_rays']:,} refracted)"
+        f"{record.results['samples_per_pixel']:.3g} samples a pixel; of {record.results['samples']:,} samples "
+        f"{counts['cast_rays_hit']:,} see a surface",
+        f"{counts['rays']:,} rays: {counts['cast_rays']:,} cast, {counts['shadow_rays']:,} shadow, "
+        f"{counts['reflection_rays']:,} reflected, {counts['refraction_rays']:,} refracted",
     ]
     if sampling == "atomic":
         lines.append(

@@ -40,6 +40,7 @@ MEANINGS: dict[str, str] = {
     "camera_polygons": "polygons drawn into the pictures of hardware cameras and hemicubes",
     "camera_fallbacks": "point-sender pairs that no camera sees well, left to another method",
     "cast_rays": "rays from the eye",
+    "cast_rays_hit": "rays from the eye, shot or settled, that met a surface",
     "shadow_rays": "rays toward lights",
     "reflection_rays": "reflected rays",
     "refraction_rays": "refracted rays",

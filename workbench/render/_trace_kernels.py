@@ -13,6 +13,7 @@ from numba import njit
 
 __all__ = [
     "AREA",
+    "AREA_BOTH_SIDES",
     "COMPLEX_SHADOW",
     "DIRECTIONAL",
     "FAINT",
@@ -46,7 +47,7 @@ __all__ = [
 NOT_INSHADOW, INSHADOW, COMPLEX_SHADOW = 0, 1, 2
 """Woo's three states of a point and a light."""
 
-POINT, DIRECTIONAL, LINEAR, LINEAR_LAMBERTIAN, AREA = range(5)
+POINT, DIRECTIONAL, LINEAR, LINEAR_LAMBERTIAN, AREA, AREA_BOTH_SIDES = range(6)
 """Laws by which a light's samples shine; a spot is a point with a cone."""
 
 FAINT = 16.0
@@ -169,7 +170,7 @@ def light_targets(law, corners, cumulative, normals, keys, salt, count, jitter, 
         shift_v = uniform(keys[i], salt + 1) if jitter else 0.0
         for k in range(count):
             u = (k + shift_u) / count
-            if law != AREA:
+            if law < AREA:
                 for c in range(3):
                     targets[i, k, c] = corners[0, 0, c] + u * (corners[0, 1, c] - corners[0, 0, c])
                     axes[i, k, c] = normals[0, c]
@@ -254,8 +255,10 @@ def light_rays(
             elif law == LINEAR_LAMBERTIAN:
                 along = ax * lx + ay * ly + az * lz
                 weight *= math.sqrt(max(1.0 - along * along, 0.0))
-            elif law == AREA:
+            elif law >= AREA:
                 along = -(ax * lx + ay * ly + az * lz)
+                if law == AREA_BOTH_SIDES and along < 0.0:
+                    ax, ay, az, along = -ax, -ay, -az, -along
                 if along <= 0.0:
                     continue
                 weight *= along
@@ -279,7 +282,7 @@ def light_rays(
                 tx, ty, tz = reach * lx, reach * ly, reach * lz
             else:
                 tx, ty, tz = targets[row, k, 0] - sx, targets[row, k, 1] - sy, targets[row, k, 2] - sz
-                if law == AREA:  # end in front of the light's own polygon
+                if law >= AREA:  # end in front of the light's own polygon
                     tx, ty, tz = tx + offset * ax, ty + offset * ay, tz + offset * az
             ray_origin[rays, 0] = (sx - centre[0]) * unit
             ray_origin[rays, 1] = (sy - centre[1]) * unit

@@ -2,8 +2,10 @@
 
 T. Whitted's recursion (CACM 23(6), 1980) turned into batches: find the closest hits, send shadow
 rays to every light, then go on with all reflected and refracted rays as one batch.  Lights are the
-scene's own (point, spot, directional, linear) and every surface that emits; linear and area lights
-take ``light_samples`` shadow rays.  Quantities are radiometric: radiance in W/(m2 sr), a diffuse
+scene's own (point, spot, directional, linear) and every surface that emits.  Soft shadows, those of
+linear lights and of surfaces, come from :mod:`workbench.shadow.occlusion`, as exact there as anywhere
+else; with ``light_samples`` these lights take a set number of shadow rays instead, as in the papers.
+Quantities are radiometric: radiance in W/(m2 sr), a diffuse
 surface under irradiance E sends rho E / pi, a highlight is the energy-conserving Phong lobe
 (e + 1) / (2 pi) cos^e around the mirrored direction, which is also the lobe of fuzzy reflection.
 An emitting surface makes no highlight: reflected rays see it themselves.
@@ -33,10 +35,12 @@ from workbench.counters import Counters
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.render import _trace_kernels as kernels
-from workbench.render._trace_kernels import COMPLEX_SHADOW
+from workbench.render._trace_kernels import COMPLEX_SHADOW, INSHADOW, NOT_INSHADOW
 from workbench.render.atomic import NO_SURFACE, Guide, RayTrees
 from workbench.render.textures import Texture
 from workbench.scene.model import Light, Scene, Surface
+from workbench.shadow.lights import LinearLight, Sender, lights_of_scene
+from workbench.shadow.occlusion import OcclusionEstimate, OcclusionState, Shader
 
 __all__ = ["ComponentCount", "DiffuseEnds", "RayTally", "TraceOptions", "Traced", "Tracer"]
 
@@ -46,6 +50,12 @@ _Work = TypeVar("_Work")
 
 BLOCK_RAYS = 16384
 """Samples a block: their wavefront stays in cache."""
+
+LIGHT_RAYS = 64
+"""Shadow rays to a light that the shadow module does not take and of which no number is asked."""
+
+SOFT_FACES = 32
+"""Faces of a surface up to which each is a light of its own to the shadow module."""
 
 MAX_CROSSINGS = 64
 """Transparent surfaces that a shadow ray passes; beyond, it counts as blocked."""
@@ -59,11 +69,14 @@ class TraceOptions:
     ----------
     depth : int
         Reflections and refractions in a row, 3 in the paper.
-    light_samples : int
-        Shadow rays to a linear or area light.
+    light_samples : int, optional
+        Shadow rays to a linear or area light, as in the papers; unless given, soft shadows are found
+        by :class:`~workbench.shadow.occlusion.Shader`.
+    shadow_error : float
+        Wanted error of soft shadows, relative to the mean irradiance of the points shaded together.
     jitter : bool
-        Move the samples of a light by a random number a point.  Off, penumbras show steps of
-        1/K; on, noise, which adaptive sampling takes for detail.
+        With ``light_samples``: move the samples of a light by a random number a point.  Off,
+        penumbras show steps of 1/K; on, noise, which adaptive sampling takes for detail.
     bundle : int
         Rays of a fuzzy reflection or refraction at the cast ray's hit (deeper ones take one);
         1 traces the sharp direction whatever the exponent.
@@ -79,7 +92,8 @@ class TraceOptions:
     """
 
     depth: int = 3
-    light_samples: int = 8
+    light_samples: int | None = None
+    shadow_error: float = 0.01
     jitter: bool = False
     bundle: int = 1
     falloff: bool = True
@@ -91,15 +105,19 @@ class TraceOptions:
         if not 0 <= self.depth <= 16:
             raise OptionError(f"depth: found {self.depth}, expected 0 to 16")
         for name in ("light_samples", "bundle"):
-            if not 1 <= getattr(self, name) <= 4096:
-                raise OptionError(f"{name}: found {getattr(self, name)}, expected 1 to 4096")
+            found = getattr(self, name)
+            if found is not None and not 1 <= found <= 4096:
+                raise OptionError(f"{name}: found {found}, expected 1 to 4096")
+        if not 0.0 < self.shadow_error < 1.0:
+            raise OptionError(f"shadow_error: found {self.shadow_error}, expected a number between 0 and 1")
 
 
 @dataclass
 class ComponentCount:
     """One component's rays: samples that ``assumed``, rays ``shot``, rays ``saved`` by assuming.
 
-    A reflected or refracted ray saved counts 1; what would have followed it is not known.
+    A reflected or refracted ray saved counts 1; what would have followed it is not known.  A light
+    whose soft shadow the shadow module finds counts 1 a point, however it was found.
     """
 
     assumed: int = 0
@@ -151,6 +169,7 @@ class RayTally:
         return Counters(
             rays=self.rays,
             cast_rays=self.cast.shot,
+            cast_rays_hit=self.cast_hits,
             shadow_rays=self.shadow.shot,
             reflection_rays=self.reflection.shot,
             refraction_rays=self.refraction.shot,
@@ -243,7 +262,10 @@ class DiffuseEnds:
 
 @dataclass(frozen=True)
 class _Emitter:
-    """A light as the kernels read it; see :func:`~workbench.render._trace_kernels.light_rays`."""
+    """A light as the kernels read it; see :func:`~workbench.render._trace_kernels.light_rays`.
+
+    With ``senders`` the shadow module finds its soft shadow, and rays serve its highlights only.
+    """
 
     law: int
     power: FloatArray
@@ -256,6 +278,7 @@ class _Emitter:
     spot_exponent: float = 0.0
     falls: bool = True
     highlight: bool = True
+    senders: tuple[Sender, ...] = ()
 
 
 def _of_light(light: Light, options: TraceOptions) -> _Emitter:
@@ -289,14 +312,15 @@ def _of_light(light: Light, options: TraceOptions) -> _Emitter:
     ends = np.concatenate([given("position"), given("end")])
     axis = ends[1:] - ends[:1]
     length = float(np.linalg.norm(axis))
+    samples = options.light_samples or LIGHT_RAYS
     return _Emitter(
         law=kernels.LINEAR_LAMBERTIAN if light.lambertian else kernels.LINEAR,
         power=light.power,
-        samples=options.light_samples,
+        samples=samples,
         corners=ends[None],
         cumulative=np.ones(1),
         normals=axis / length,
-        scale=length / options.light_samples,
+        scale=length / samples,
     )
 
 
@@ -306,14 +330,15 @@ def _of_surface(surface: Surface, options: TraceOptions) -> _Emitter:
     triangles, _ = geometry.triangles
     vector = 0.5 * np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(vector, axis=1)
+    samples = options.light_samples or LIGHT_RAYS
     return _Emitter(
-        law=kernels.AREA,
+        law=kernels.AREA_BOTH_SIDES if surface.material.two_sided else kernels.AREA,
         power=surface.material.emission / np.pi,
-        samples=options.light_samples,
+        samples=samples,
         corners=triangles,
         cumulative=np.cumsum(area) / area.sum(),
         normals=vector / area[:, None],
-        scale=float(area.sum()) / options.light_samples,
+        scale=float(area.sum()) / samples,
         highlight=False,
     )
 
@@ -432,6 +457,43 @@ class Tracer:
         self.light_names = tuple(
             [light.name for light in scene.lights if light.power.any()] + [s.name for s in emitting]
         )
+        self._shader: Shader | None = None
+        if self.options.light_samples is None:
+            self._set_up_soft_shadows()
+
+    def _set_up_soft_shadows(self) -> None:
+        """Give linear and area lights to the shadow module, where it knows all that their shadows need.
+
+        To it a pane is grey, and every face of a surface a light.
+        """
+        panes = self._materials.transmittance[self._materials.clear]
+        if (panes != panes[:, :1]).any():
+            return
+        scene = self.scene
+        dark = np.zeros(self.bands)
+        surfaces = tuple(
+            surface
+            if surface.sphere is not None or surface.face_count <= SOFT_FACES
+            else replace(surface, material=replace(surface.material, emission=dark))
+            for surface in scene.surfaces
+        )
+        senders = lights_of_scene(replace(scene, surfaces=surfaces), self._geometry)
+        shining = sum(bool(light.power.any()) for light in scene.lights)
+        parts: list[list[Sender]] = [[] for _ in self._lights]
+        place = {name: i for i, name in enumerate(self.light_names[shining:], shining)}
+        for i, sender in enumerate(senders):
+            if i < shining:
+                if isinstance(sender, LinearLight):
+                    parts[i].append(sender)
+            else:
+                surface = int(self._geometry.polygon_surface[sender.polygons[0]])
+                parts[place[scene.surfaces[surface].name]].append(sender)
+        self._lights = [
+            replace(light, senders=tuple(own) if len(own) <= SOFT_FACES else ())
+            for light, own in zip(self._lights, parts, strict=True)
+        ]
+        if any(light.senders for light in self._lights):
+            self._shader = Shader(self._geometry, workers=1)
 
     def _set_up_shadows(self) -> None:
         clear: NDArray[np.bool_] = self._materials.clear
@@ -708,6 +770,28 @@ class _Found:
     agreed: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class _Shading:
+    """What lights need of the hits of a wave: keys of random numbers, lit sides, reflectance, mirrored directions.
+
+    Light is added to ``leaving`` (n, bands).
+    """
+
+    keys: NDArray[np.uint64]
+    lit: NDArray[np.bool_]
+    reflectance: FloatArray
+    mirrored: FloatArray
+    leaving: FloatArray
+
+
+def _joined(estimate: OcclusionEstimate) -> NDArray[np.uint8]:
+    """One state (n,) of the parts of a light: all in shadow, none in shadow, or complex; parts unseen have no say."""
+    away = estimate.open_share <= 0.0
+    dark = (away | (estimate.state == OcclusionState.INSHADOW)).all(axis=1)
+    clear = (away | (estimate.state == OcclusionState.NOT_INSHADOW)).all(axis=1)
+    return np.where(dark, INSHADOW, np.where(clear, NOT_INSHADOW, COMPLEX_SHADOW)).astype(np.uint8)
+
+
 class _Sweep:
     """One block of samples on its way through the scene."""
 
@@ -722,6 +806,7 @@ class _Sweep:
     ) -> None:
         self.tracer, self.tally, self.record, self.guided = tracer, tally, record, guided
         self.surface, self.saved = surface, saved
+        self._kept: tuple[NDArray[np.float32], NDArray[np.float32], FloatArray, FloatArray, IntArray] | None = None
         if record is not None:
             self.nodes = record.nodes
         else:
@@ -903,42 +988,90 @@ class _Sweep:
         highlights_only: bool = False,
     ) -> None:
         """Add the light of every light to ``leaving`` (n, bands); or of those only that make highlights."""
-        tracer, count, materials = self.tracer, len(found.ray), self.tracer._materials
-        centre, unit = tracer._opaque.frame
+        tracer, count = self.tracer, len(found.ray)
         keys = wave.keys[found.ray] if tracer.options.jitter else wave.keys[:0]
+        at = _Shading(keys, lit, reflectance, mirrored, leaving)
         assumed = np.full(count, COMPLEX_SHADOW, dtype=np.uint8)
-        states = np.empty(count, dtype=np.uint8)
-        seen, out_of_cone = np.empty(count, dtype=np.int64), np.empty(count, dtype=bool)
-        size = count * max((light.samples for light in tracer._lights), default=0)
-        origin, along = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
-        weight, lobe_weight, owner = np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
         recorded = found.node >= 0
         for index, light in enumerate(tracer._lights):
             if highlights_only and not light.highlight:
                 continue
             if self.guided is not None:
                 kernels.assume(found.agreed, found.pixel, found.node, self.guided.guide.state, index, assumed)
-            targets, axes = self._targets(light, index, keys)
-            rays = kernels.light_rays(
-                light.law, targets, axes, light.scale, light.cosine_cut, light.spot_exponent, light.falls,
-                light.highlight, light.power, tracer.offset, centre, unit,
-                found.points, found.facing, found.shading, mirrored, materials.highlight_exponent, lit, assumed,
-                reflectance, materials.specular, found.surface,
-                leaving, seen, out_of_cone, origin, along, weight, lobe_weight, owner,
-            )  # fmt: skip
-            through = tracer.transmitted(origin[:rays], along[:rays])
-            kernels.gather_light(
-                rays, through, weight, lobe_weight, owner, light.power, reflectance, materials.specular,
-                found.surface, assumed, out_of_cone, leaving, states,
-            )  # fmt: skip
+            send = self._soft_light if light.senders else self._light_by_rays
+            states, seen, shot = send(light, index, found, at, assumed)
             tally = self.tally.shadows[index]
-            tally.shot += rays
+            tally.shot += shot
             if self.record is not None:
                 self.record.state[found.sample[recorded], found.node[recorded], index] = states[recorded]
             if self.guided is not None:
                 points, spared = kernels.count_spared(assumed, lit, seen, found.sample, self.saved)
                 tally.assumed += points
                 tally.saved += spared
+
+    def _light_by_rays(
+        self, light: _Emitter, index: int, found: _Found, at: _Shading, assumed: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.uint8], IntArray, int]:
+        """Add one light by a ray a sample of it; returns states, samples above each horizon, and rays shot."""
+        tracer, count, materials = self.tracer, len(found.ray), self.tracer._materials
+        states = np.empty(count, dtype=np.uint8)
+        seen, out_of_cone = np.empty(count, dtype=np.int64), np.empty(count, dtype=bool)
+        room = self._room(count * light.samples)
+        targets, axes = self._targets(light, index, at.keys)
+        rays = kernels.light_rays(
+            light.law, targets, axes, light.scale, light.cosine_cut, light.spot_exponent, light.falls,
+            light.highlight, light.power, tracer.offset, *tracer._opaque.frame,
+            found.points, found.facing, found.shading, at.mirrored, materials.highlight_exponent, at.lit, assumed,
+            at.reflectance, materials.specular, found.surface,
+            at.leaving, seen, out_of_cone, *room,
+        )  # fmt: skip
+        origin, along, weight, lobe_weight, owner = room
+        through = tracer.transmitted(origin[:rays], along[:rays])
+        kernels.gather_light(
+            rays, through, weight, lobe_weight, owner, light.power, at.reflectance, materials.specular,
+            found.surface, assumed, out_of_cone, at.leaving, states,
+        )  # fmt: skip
+        return states, seen, rays
+
+    def _room(self, size: int) -> tuple[NDArray[np.float32], NDArray[np.float32], FloatArray, FloatArray, IntArray]:
+        """Room for shadow rays, kept from light to light: origins, directions, weights (two), owners."""
+        if self._kept is None or len(self._kept[-1]) < size:
+            self._kept = (
+                np.empty((size, 3), np.float32), np.empty((size, 3), np.float32),
+                np.empty(size), np.empty(size), np.empty(size, dtype=np.int64),
+            )  # fmt: skip
+        return self._kept
+
+    def _soft_light(
+        self, light: _Emitter, index: int, found: _Found, at: _Shading, assumed: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.uint8], IntArray, int]:
+        """Add one light as the shadow module finds it; returns as :meth:`_light_by_rays`, a point counting 1.
+
+        Highlights are sampled along the light: without rays where all or none of it is seen.
+        """
+        tracer = self.tracer
+        states = np.where(assumed == COMPLEX_SHADOW, INSHADOW, assumed).astype(np.uint8)
+        received = np.zeros_like(at.reflectance)
+        open_rows = np.flatnonzero(at.lit & (assumed == NOT_INSHADOW))
+        if len(open_rows):
+            points, normals = found.points[open_rows], found.shading[open_rows]
+            received[open_rows] = sum(sender.irradiance(points, normals) for sender in light.senders)
+        asked = np.flatnonzero(at.lit & (assumed == COMPLEX_SHADOW))
+        if len(asked):
+            assert tracer._shader is not None
+            estimate = tracer._shader.estimate(
+                found.points[asked], found.shading[asked], light.senders, error=tracer.options.shadow_error,
+                samples=LIGHT_RAYS, seed=tracer.options.seed, own_polygon=found.polygon[asked],
+            )  # fmt: skip
+            received[asked] = estimate.irradiance
+            states[asked] = _joined(estimate)
+        np.add(at.leaving, at.reflectance * (received / np.pi), out=at.leaving)
+        if light.highlight:
+            shiny = at.lit & (tracer._materials.highlight_exponent[found.surface] >= 0.0)
+            if shiny.any():
+                glossy = replace(at, lit=shiny, reflectance=np.zeros_like(at.reflectance))
+                self._light_by_rays(light, index, found, glossy, states)
+        return states, at.lit.astype(np.int64), len(asked)
 
     def _targets(self, light: _Emitter, index: int, keys: NDArray[np.uint64]) -> tuple[FloatArray, FloatArray]:
         if light.law in (kernels.POINT, kernels.DIRECTIONAL):
