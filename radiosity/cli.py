@@ -419,6 +419,14 @@ main.add_command(shadow)
 )
 @click.option("--whole-tree", is_flag=True, help="Assume down the whole ray tree, not at its top only.")
 @click.option(
+    "--normal-angle",
+    type=click.FloatRange(0, 180, min_open=True),
+    callback=_finite,
+    metavar="DEG",
+    help="Assume nothing where normals differ by more than this.  [default: no such criterion]",
+)
+@click.option("--shared-boundary", is_flag=True, help="Also cut pixels on whose boundary a neighbour's samples differ.")
+@click.option(
     "--threshold",
     type=click.FloatRange(min=-1, max=1),
     callback=_finite,
@@ -430,12 +438,19 @@ main.add_command(shadow)
 @click.option("--level", type=click.IntRange(1, 8), default=3, show_default=True, help="Of subdivision; 3: 25 samples.")
 @click.option("--depth", type=click.IntRange(0, 16), default=3, show_default=True, help="Reflections in a row.")
 @click.option(
+    "--shadow-error",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    callback=_finite,
+    default=0.01,
+    show_default=True,
+    metavar="E",
+    help="Wanted error of soft shadows, relative to the mean irradiance.",
+)
+@click.option(
     "--light-samples",
     type=click.IntRange(1, 4096),
-    default=16,
-    show_default=True,
     metavar="K",
-    help="Shadow rays to a linear or area light.",
+    help="Rather take K shadow rays to each linear or area light, as in the papers.",
 )
 @click.option(
     "--bundle", type=click.IntRange(1, 4096), default=1, show_default=True, help="Rays of a fuzzy reflection."
@@ -461,10 +476,13 @@ def render(
     sampling: str,
     components: str,
     whole_tree: bool,
+    normal_angle: float | None,
+    shared_boundary: bool,
     threshold: float,
     level: int,
     depth: int,
-    light_samples: int,
+    shadow_error: float,
+    light_samples: int | None,
     bundle: int,
     falloff: bool | None,
     white: float | None,
@@ -486,7 +504,8 @@ def render(
     check_picture_path(path)
     if json_path not in (None, "-") and not Path(str(json_path)).parent.is_dir():
         raise InputError(f"{json_path}: found no such folder, expected one; give another --json FILE")
-    atomic = AtomicOptions(tuple(name for name in components.split(",") if name), whole_tree=whole_tree)
+    chosen = tuple(name.strip() for name in components.split(",") if name.strip())
+    atomic = AtomicOptions(chosen, whole_tree=whole_tree, similar=max(threshold, 0.0), normal_angle_deg=normal_angle)
     start = time.perf_counter()
     loaded = workbench.load(scene)
     seconds_reading = time.perf_counter() - start
@@ -496,6 +515,7 @@ def render(
     options = TraceOptions(
         depth=depth,
         light_samples=light_samples,
+        shadow_error=shadow_error,
         bundle=bundle,
         falloff=not nff if falloff is None else falloff,
         see_backs=not nff,
@@ -508,6 +528,7 @@ def render(
         atomic=atomic,
         threshold=threshold,
         level=level,
+        shared_boundary=shared_boundary,
         white=white,
         width=width,
         workers=workers or os.cpu_count() or 1,
@@ -515,6 +536,7 @@ def render(
     record = drawn.record
     record.seconds = {"read scene": seconds_reading} | record.seconds
     record.settings |= {"depth": depth, "light_samples": light_samples, "bundle": bundle, "seed": seed}
+    record.settings |= {"shadow_error": shadow_error, "normal_angle_deg": normal_angle}
     record.settings |= {"falloff": options.falloff, "atomic": components, "whole_tree": whole_tree, "scene": scene}
     write_picture(path, drawn.pixels)
     if json_path is not None:

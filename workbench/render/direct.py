@@ -52,6 +52,7 @@ def render_direct(
     atomic: AtomicOptions | None = None,
     threshold: float = 0.06,
     level: int = 3,
+    shared_boundary: bool = False,
     white: float | None = None,
     width: int | None = None,
     workers: int = 1,
@@ -66,7 +67,7 @@ def render_direct(
     options : TraceOptions, optional
     atomic : AtomicOptions, optional
         For ``sampling="atomic"``.
-    threshold, level
+    threshold, level, shared_boundary
         Of :func:`~workbench.render.adaptive.adaptive`.
     white : float, optional
         Radiance shown as white; chosen from a coarse look unless given. [W m-2 sr-1]
@@ -96,7 +97,7 @@ def render_direct(
     record = RunRecord(
         "render",
         settings={"sampling": sampling, "width": rays.width, "height": rays.height, "threshold": threshold,
-                  "level": level, "workers": workers},
+                  "level": level, "shared_boundary": shared_boundary, "workers": workers},
     )  # fmt: skip
     with record.stage("build"):
         tracer = Tracer(scene, options, workers=workers)
@@ -109,7 +110,15 @@ def render_direct(
             picture = aliased(tracer, rays)
         else:
             chosen = None if sampling == "adaptive" else atomic or AtomicOptions()
-            picture = adaptive(tracer, rays, threshold=threshold, level=level, atomic=chosen, white=white)
+            picture = adaptive(
+                tracer,
+                rays,
+                threshold=threshold,
+                level=level,
+                atomic=chosen,
+                shared_boundary=shared_boundary,
+                white=white,
+            )
     record.counters.merge(picture.tally.counters())
     record.results |= {
         "white_W_m2_sr": white,
