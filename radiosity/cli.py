@@ -404,10 +404,14 @@ main.add_command(shadow)
 )
 @click.option(
     "--sampling",
-    type=click.Choice(["aliased", "adaptive", "atomic"]),
+    type=click.Choice(["aliased", "rows", "supersampled", "adaptive", "atomic"]),
     default="atomic",
     show_default=True,
-    help="One ray a pixel, adaptive sampling, or atomic adaptive sampling.",
+    help="One ray a pixel; the same row by row with counted plane-vertex checks; a square of rays a pixel; adaptive "
+    "sampling; atomic adaptive sampling.",
+)
+@click.option(
+    "--side", type=click.IntRange(1, 64), default=4, show_default=True, help="Rays each way, if supersampled."
 )
 @click.option(
     "--atomic",
@@ -474,6 +478,7 @@ def render(
     path: Path,
     direct_only: bool,
     sampling: str,
+    side: int,
     components: str,
     whole_tree: bool,
     normal_angle: float | None,
@@ -529,6 +534,7 @@ def render(
         threshold=threshold,
         level=level,
         shared_boundary=shared_boundary,
+        side=side,
         white=white,
         width=width,
         workers=workers or os.cpu_count() or 1,
@@ -553,6 +559,11 @@ def render(
         lines.append(
             f"saved: {counts['cast_rays_saved']:,} cast, {counts['shadow_rays_saved']:,} shadow, "
             f"{counts['reflection_rays_saved']:,} reflected, {counts['refraction_rays_saved']:,} refracted"
+        )
+    if sampling == "rows":
+        lines.append(
+            f"cast rays row by row: {counts['polygon_tests']:,} polygon tests, {counts['tests_avoided']:,} avoided by "
+            f"{counts['plane_vertex_checks']:,} plane-vertex checks; {record.results['first_pass_s']:.2f} s"
         )
     lines.append("seconds: " + "; ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()))
     click.echo("\n".join([*lines, str(path)]), err=json_path == "-")

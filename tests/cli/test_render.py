@@ -72,7 +72,7 @@ def picture(path):
     return np.asarray(Image.open(path)).astype(int)
 
 
-@pytest.mark.parametrize("sampling", ["aliased", "adaptive", "atomic"])
+@pytest.mark.parametrize("sampling", ["aliased", "rows", "supersampled", "adaptive", "atomic"])
 def test_a_picture_and_its_record(room, tmp_path, sampling):
     out = tmp_path / "room.png"
     result = render(room, "-o", out, "--direct-only", "--sampling", sampling, "--json", tmp_path / "r.json")
@@ -85,6 +85,9 @@ def test_a_picture_and_its_record(room, tmp_path, sampling):
     assert record["counters"]["cast_rays"] > 0 and record["counters"]["reflection_rays"] > 0
     assert record["settings"]["sampling"] == sampling
     assert (record["counters"].get("shadow_rays_saved", 0) > 0) == (sampling == "atomic")
+    assert (record["counters"].get("plane_vertex_checks", 0) > 0) == (sampling == "rows")
+    assert ("avoided by" in result.stdout) == (sampling == "rows")
+    assert record["counters"]["cast_rays_hit"] > 0 and "see a surface" in result.stdout
     assert "white" in record["choices"]
     assert str(out) in result.stdout
 
@@ -95,6 +98,34 @@ def test_sampling_changes_little_and_workers_nothing(room, tmp_path):
     a, b, c = (picture(tmp_path / f"{name}.tiff") for name in "abc")
     np.testing.assert_array_equal(b, c)
     assert np.sqrt(((a - b) ** 2).mean()) < 4
+
+
+def test_criteria_and_light_samples_reach_the_tracer(room, tmp_path):
+    lamp = (
+        'name = "floor"',
+        'name = "lamp surface"\nmaterial = "glow"\npolygon = [[-1, -1, 3], [-1, 1, 3], [1, 1, 3], [1, -1, 3]]',
+    )
+    text = room.read_text().replace(
+        "[materials.mirror]", "[materials.glow]\nreflectance = 0\nemission = 3\n[materials.mirror]"
+    )
+    room.write_text(text.replace("[[light]]", f"[[surface]]\n{lamp}\n[[light]]"))
+    counts = {}
+    for name, more in (
+        ("plain", []),
+        ("normals", ["--normal-angle", 2]),
+        ("boundary", ["--shared-boundary"]),
+        ("rays", ["--light-samples", 9]),
+        ("error", ["--shadow-error", 0.1]),
+    ):
+        path = tmp_path / f"{name}.json"
+        result = render(room, "-o", tmp_path / "x.png", "--direct-only", "--white", 1.5, "--json", path, *more)
+        assert result.exit_code == 0, result.output
+        record = json.loads(path.read_text())
+        counts[name] = record["counters"] | {"samples": record["results"]["samples"]}
+    assert counts["normals"]["cast_rays_saved"] <= counts["plain"]["cast_rays_saved"]
+    assert counts["normals"]["shadow_rays_saved"] < counts["plain"]["shadow_rays_saved"]
+    assert counts["boundary"]["samples"] > counts["plain"]["samples"]
+    assert counts["rays"]["shadow_rays"] > 3 * counts["plain"]["shadow_rays"]
 
 
 def test_nff_lights_do_not_fall_off_and_the_width_scales_both_sides(tmp_path):
@@ -117,6 +148,9 @@ def test_nff_lights_do_not_fall_off_and_the_width_scales_both_sides(tmp_path):
         (["--direct-only", "--atomic", "shadow"], "shadow"),
         (["--direct-only", "--level", "9"], "9"),
         (["--direct-only", "--threshold", "nan"], "nan"),
+        (["--direct-only", "--normal-angle", "0"], "normal-angle"),
+        (["--direct-only", "--shadow-error", "1"], "shadow-error"),
+        (["--direct-only", "--side", "65"], "side"),
         (["--direct-only", "--json", "no/such/r.json"], "no such folder"),
     ],
 )

@@ -17,9 +17,10 @@ from workbench.accel.voxel_grid import VoxelGrid
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.record import RunRecord
+from workbench.render import rows as render_rows
 from workbench.render.camera import PinholeRays
 from workbench.shadow.woo import soft_shadow_kludge
-from workbench.study import corner_samples, tori
+from workbench.study import tori
 from workbench.study.camera_table import PAPER_SECONDS, camera_study
 from workbench.study.corner_samples import corner_hits, corner_study, spheres_scene
 from workbench.study.hit_rates import METHODS, Setting, hit_rates, sweep
@@ -117,7 +118,7 @@ def test_rows_miss_polygons_when_the_margin_is_broken(monkeypatch):
     grid = VoxelGrid(Geometry.from_scene(scene))
     rays = PinholeRays.from_camera(scene.camera)
     plain = corner_hits(grid, rays, check=False)
-    monkeypatch.setattr(corner_samples, "MARGIN", -1e15)  # whatever crosses the plane counts as outside
+    monkeypatch.setattr(render_rows, "MARGIN", -1e15)  # whatever crosses the plane counts as outside
     assert (corner_hits(grid, rays).hits.polygon != plain.hits.polygon).any()
 
 

@@ -27,7 +27,7 @@ from workbench.render.atomic import AtomicOptions, Guide, RayTrees
 from workbench.render.camera import PinholeRays
 from workbench.render.trace import ComponentCount, RayTally, Tracer
 
-__all__ = ["Picture", "adaptive", "aliased", "supersampled"]
+__all__ = ["Picture", "adaptive", "aliased", "camera_rays", "supersampled"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -61,7 +61,8 @@ class Picture:
     seconds: float
 
 
-def _camera(tracer: Tracer, camera: PinholeRays | None) -> PinholeRays:
+def camera_rays(tracer: Tracer, camera: PinholeRays | None) -> PinholeRays:
+    """``camera``, or the rays of the scene's own; an :class:`InputError` if there is none."""
     if camera is not None:
         return camera
     if tracer.scene.camera is None:
@@ -72,16 +73,16 @@ def _camera(tracer: Tracer, camera: PinholeRays | None) -> PinholeRays:
 def _uniform(tracer: Tracer, camera: PinholeRays | None, side: int, rows: int) -> Picture:
     """``side`` x ``side`` samples at the middles of equal parts of each pixel."""
     start = time.perf_counter()
-    rays = _camera(tracer, camera)
+    rays = camera_rays(tracer, camera)
     radiance = np.empty((rays.height, rays.width, tracer.bands))
     tally = RayTally([ComponentCount() for _ in range(tracer.light_count)])
     for first in range(0, rays.height, rows):
         end = min(first + rows, rays.height)
         line, column = np.meshgrid(np.arange(first * side, end * side), np.arange(rays.width * side), indexing="ij")
-        found = tracer.trace(
-            rays.eye,
+        found = tracer.trace_unchecked(
+            rays.eye[None],
             rays.directions((column.ravel() + 0.5) / side, (line.ravel() + 0.5) / side),
-            keys=(line * rays.width * side + column).ravel(),
+            (line * rays.width * side + column).ravel(),
         )
         block = found.radiance.reshape(end - first, side, rays.width, side, tracer.bands)
         radiance[first:end] = block.mean(axis=(1, 3))
@@ -173,7 +174,7 @@ def adaptive(
     if atomic is not None:
         atomic = replace(atomic, similar=atomic.similar * white)
     start = time.perf_counter()
-    rays = _camera(tracer, camera)
+    rays = camera_rays(tracer, camera)
     band = _Bands(tracer, rays, threshold * white, white, 2 ** (level - 1), atomic, shared_boundary)
     for first in range(0, rays.height, rows):
         band.sample(first, min(first + rows, rays.height))

@@ -9,17 +9,18 @@ from numpy.typing import NDArray
 
 from workbench.errors import InputError, OptionError
 from workbench.record import RunRecord
-from workbench.render.adaptive import Picture, adaptive, aliased
+from workbench.render.adaptive import Picture, adaptive, aliased, supersampled
 from workbench.render.atomic import AtomicOptions
 from workbench.render.camera import PinholeRays
 from workbench.render.image import to_bytes
+from workbench.render.rows import picture_by_rows
 from workbench.render.trace import TraceOptions, Tracer
 from workbench.scene.model import Scene
 
 __all__ = ["SAMPLINGS", "DirectPicture", "render_direct"]
 
-SAMPLINGS = ("aliased", "adaptive", "atomic")
-"""One ray a pixel, adaptive sampling, atomic adaptive sampling."""
+SAMPLINGS = ("aliased", "rows", "supersampled", "adaptive", "atomic")
+"""One ray a pixel, the same in Woo's two passes a row, a square of rays, adaptive and atomic adaptive sampling."""
 
 _GLANCE = 96
 
@@ -53,6 +54,7 @@ def render_direct(
     threshold: float = 0.06,
     level: int = 3,
     shared_boundary: bool = False,
+    side: int = 4,
     white: float | None = None,
     width: int | None = None,
     workers: int = 1,
@@ -63,12 +65,15 @@ def render_direct(
     ----------
     scene : Scene
         Of 1 or 3 bands, with a camera.
-    sampling : {"aliased", "adaptive", "atomic"}
+    sampling : str
+        One of :data:`SAMPLINGS`.
     options : TraceOptions, optional
     atomic : AtomicOptions, optional
         For ``sampling="atomic"``.
     threshold, level, shared_boundary
         Of :func:`~workbench.render.adaptive.adaptive`.
+    side : int
+        Rays each way in a pixel, for ``sampling="supersampled"``.
     white : float, optional
         Radiance shown as white; chosen from a coarse look unless given. [W m-2 sr-1]
     width : int, optional
@@ -97,7 +102,7 @@ def render_direct(
     record = RunRecord(
         "render",
         settings={"sampling": sampling, "width": rays.width, "height": rays.height, "threshold": threshold,
-                  "level": level, "shared_boundary": shared_boundary, "workers": workers},
+                  "level": level, "side": side, "shared_boundary": shared_boundary, "workers": workers},
     )  # fmt: skip
     with record.stage("build"):
         tracer = Tracer(scene, options, workers=workers)
@@ -108,6 +113,14 @@ def render_direct(
     with record.stage("trace"):
         if sampling == "aliased":
             picture = aliased(tracer, rays)
+        elif sampling == "rows":
+            by_rows = picture_by_rows(tracer, rays)
+            picture = by_rows.picture
+            # The tally has these rays too.
+            record.counters.merge({k: v for k, v in by_rows.counters.items() if k not in ("rays", "rays_hit")})
+            record.results["first_pass_s"] = by_rows.first_pass_s
+        elif sampling == "supersampled":
+            picture = supersampled(tracer, side, rays)
         else:
             chosen = None if sampling == "adaptive" else atomic or AtomicOptions()
             picture = adaptive(

@@ -414,6 +414,8 @@ class Tracer:
     ----------
     light_names : tuple of str
         The scene's lights, then its emitting surfaces: the order of the tally's ``shadows``.
+    geometry : Geometry
+        The scene's polygons.
 
     Raises
     ------
@@ -440,14 +442,14 @@ class Tracer:
             raise InputError(f"textures: found {unknown[0]!r}, expected the name of a surface")
         self._textures = {i: textures[name] for i, name in enumerate(names) if name in textures} if textures else {}
         self._materials = _Materials(scene)
-        self._geometry = Geometry.from_scene(scene)
-        triangles, piece = self._geometry.triangles
-        polygon = self._geometry.piece_polygon[piece]
+        self.geometry = Geometry.from_scene(scene)
+        triangles, piece = self.geometry.triangles
+        polygon = self.geometry.piece_polygon[piece]
         self._triangles = triangles
-        self._first_triangle = np.searchsorted(polygon, np.arange(self._geometry.polygon_count + 1))
-        self._corner_normals = _corner_normals(scene, self._geometry)
-        self._surface = np.append(self._geometry.polygon_surface, NO_SURFACE).astype(np.int32)
-        self._all = EmbreeAccelerator(self._geometry)
+        self._first_triangle = np.searchsorted(polygon, np.arange(self.geometry.polygon_count + 1))
+        self._corner_normals = _corner_normals(scene, self.geometry)
+        self._surface = np.append(self.geometry.polygon_surface, NO_SURFACE).astype(np.int32)
+        self._all = EmbreeAccelerator(self.geometry)
         self.offset = self._all.offset
         self._set_up_shadows()
         emitting = [surface for surface in scene.surfaces if surface.material.emission.any()]
@@ -477,7 +479,7 @@ class Tracer:
             else replace(surface, material=replace(surface.material, emission=dark))
             for surface in scene.surfaces
         )
-        senders = lights_of_scene(replace(scene, surfaces=surfaces), self._geometry)
+        senders = lights_of_scene(replace(scene, surfaces=surfaces), self.geometry)
         shining = sum(bool(light.power.any()) for light in scene.lights)
         parts: list[list[Sender]] = [[] for _ in self._lights]
         place = {name: i for i, name in enumerate(self.light_names[shining:], shining)}
@@ -486,14 +488,14 @@ class Tracer:
                 if isinstance(sender, LinearLight):
                     parts[i].append(sender)
             else:
-                surface = int(self._geometry.polygon_surface[sender.polygons[0]])
+                surface = int(self.geometry.polygon_surface[sender.polygons[0]])
                 parts[place[scene.surfaces[surface].name]].append(sender)
         self._lights = [
             replace(light, senders=tuple(own) if len(own) <= SOFT_FACES else ())
             for light, own in zip(self._lights, parts, strict=True)
         ]
         if any(light.senders for light in self._lights):
-            self._shader = Shader(self._geometry, workers=1)
+            self._shader = Shader(self.geometry, workers=1)
 
     def _set_up_shadows(self) -> None:
         clear: NDArray[np.bool_] = self._materials.clear
@@ -584,8 +586,13 @@ class Tracer:
         guide: Guide | None = None,
         guide_rows: IntArray | None = None,
         place: tuple[FloatArray, FloatArray] | None = None,
+        *,
+        met: IntArray | None = None,
     ) -> Traced:
-        """:meth:`trace` for callers that made the rays themselves: nothing is checked."""
+        """:meth:`trace` for callers that made the rays themselves: nothing is checked.
+
+        ``met`` (n,): polygons that the rays are known to meet, -1 for none; they are not cast again.
+        """
         count = len(along)
         salted = kernels.child_keys(number.astype(np.uint64), self.options.seed, 1)
         guided = None
@@ -603,6 +610,7 @@ class Tracer:
                 None if guided is None else guided.rows(rows),
                 surface[rows],
                 saved[rows],
+                None if met is None else met[rows],
             )
             radiance[rows] = sweep.follow(_first_wave(start, along, salted, rows), 0)
             return sweep.tally
@@ -803,7 +811,9 @@ class _Sweep:
         guided: _Guided | None,
         surface: IntArray,
         saved: IntArray,
+        met: IntArray | None = None,
     ) -> None:
+        self.met = met
         self.tracer, self.tally, self.record, self.guided = tracer, tally, record, guided
         self.surface, self.saved = surface, saved
         self._kept: tuple[NDArray[np.float32], NDArray[np.float32], FloatArray, FloatArray, IntArray] | None = None
@@ -916,7 +926,10 @@ class _Sweep:
             whole = len(rest) == count
             start = wave.origins if whole else wave.origins[rest]
             along = wave.directions if whole else wave.directions[rest]
-            polygon[rest] = tracer._all.nearest_raw(*kernels.unit_rays(start, along, *tracer._all.frame))
+            if depth == 0 and self.met is not None:
+                polygon[:] = self.met
+            else:
+                polygon[rest] = tracer._all.nearest_raw(*kernels.unit_rays(start, along, *tracer._all.frame))
             if depth == 0:
                 self.tally.cast.shot += len(rest)
             met = rest[polygon[rest] != NO_POLYGON]

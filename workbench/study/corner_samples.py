@@ -4,37 +4,31 @@ Source: A. Woo, "Efficient Shadow Computations in Ray Tracing" (IEEE CG&A 13(5),
 plane-vertex checking": the X + 1 corner samples of a row lie in one plane through the eye, so a
 polygon that does not cross it is set aside for the whole row, K = X + 1.  He reports "only about 5
 percent" of time saved, "due to the already efficient voxel culler".
-
-The loop is that of his Figure 4 with the eye for S and the row for the light, but looks for the
-nearest hit.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from workbench.accel.base import NO_POLYGON, Hits
-from workbench.accel.voxel_grid import CLOSEST, COUNTED, RayIDs, VoxelGrid, walk
-from workbench.counters import Counters
+from workbench.accel.voxel_grid import VoxelGrid
 from workbench.geometry.flat import Geometry
 from workbench.record import RunRecord
 from workbench.render.camera import PinholeRays
+from workbench.render.rows import RowHits, cast_rows
 from workbench.scene.library import diffuse, sphere_surface
 from workbench.scene.model import Scene, Surface
-from workbench.shadow.woo import MARGIN, light_occlusion
+from workbench.shadow.woo import light_occlusion
 from workbench.study.result import StudyResult, interleaved
 from workbench.study.tori import LIGHT, first_hits, tori_scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CornerHits", "corner_hits", "corner_study", "spheres_scene"]
+__all__ = ["corner_hits", "corner_study", "spheres_scene"]
 
 FloatArray = NDArray[np.float64]
 
@@ -42,38 +36,7 @@ PAPER_SAVED = 5.0
 """Woo's percentage, of his corner samples."""
 
 
-@njit(nogil=True, cache=True)
-def _row_loop(objects, cells, eye, directions, skip, planes, mailbox, t, polygon, counts):
-    # Rows of cast rays.  ``planes`` (rows, 2, 4) are both sides of each row's plane; (rows, 0, 4)
-    # leaves the check out.
-    columns = directions.shape[1]
-    touched = np.zeros_like(mailbox)
-    no_planes = np.empty((0, 4))
-    origin, direction, through = np.empty((1, 3)), np.empty((1, 3)), np.empty(0)
-    origin[0, :] = eye
-    current = 1
-    for row in range(directions.shape[0]):
-        first = current
-        last = first + columns - 1
-        for column in range(columns):
-            direction[0, :] = directions[row, column]
-            t[row, column], index = walk(
-                objects, cells, origin, direction, 0, np.inf, skip, CLOSEST, mailbox, touched, current, first, last,
-                planes[row] if column != columns - 1 else no_planes, False, True, through, counts,
-            )  # fmt: skip
-            polygon[row, column] = objects.owner[index] if index >= 0 else NO_POLYGON
-            current += 1
-
-
-@dataclass(frozen=True)
-class CornerHits:
-    """First hits of the corner samples, shape (height + 1, width + 1), and what they took."""
-
-    hits: Hits
-    counters: Counters
-
-
-def corner_hits(grid: VoxelGrid, rays: PinholeRays, *, check: bool = True) -> CornerHits:
+def corner_hits(grid: VoxelGrid, rays: PinholeRays, *, check: bool = True) -> RowHits:
     """Cast a ray through every corner of every pixel, row after row.
 
     Parameters
@@ -87,23 +50,7 @@ def corner_hits(grid: VoxelGrid, rays: PinholeRays, *, check: bool = True) -> Co
     rows, columns = rays.height + 1, rays.width + 1
     y, x = np.meshgrid(np.arange(rows, dtype=np.float64), np.arange(columns, dtype=np.float64), indexing="ij")
     directions = rays.directions(x.ravel(), y.ravel()).reshape(rows, columns, 3)
-    grid.check_origins(rays.eye[None])
-    planes = np.empty((rows, 0, 4))
-    if check:
-        normal = np.cross(directions[:, 0], directions[:, -1])
-        # The slack of workbench.shadow.woo: |N . v| <= |a| |b| |v|, here with unit a and b.
-        reach = np.abs(rays.eye).max() + grid.objects.reach
-        slack = np.full((rows, 1), MARGIN * np.finfo(float).eps * reach)
-        planes = np.stack([np.hstack([normal, slack]), np.hstack([-normal, slack])], axis=1)
-    t, polygon = np.empty((rows, columns)), np.empty((rows, columns), dtype=np.int64)
-    counts = np.zeros(len(COUNTED), dtype=np.int64)
-    skip = np.full((1, 2), NO_POLYGON)
-    ids = RayIDs(grid.object_count)
-    _row_loop(
-        grid.objects, grid.cells, np.ascontiguousarray(rays.eye), directions, skip, planes, ids.mailbox, t, polygon,
-        counts,
-    )  # fmt: skip
-    return CornerHits(Hits(t, polygon), Counters(**dict(zip(COUNTED, counts.tolist(), strict=True))))
+    return cast_rows(grid, rays.eye, directions, check=check)
 
 
 def spheres_scene(*, facet_error: float = 0.008, width: int = 640, height: int = 480) -> Scene:
