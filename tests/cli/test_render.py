@@ -101,10 +101,7 @@ def test_sampling_changes_little_and_workers_nothing(room, tmp_path):
 
 
 def test_criteria_and_light_samples_reach_the_tracer(room, tmp_path):
-    lamp = (
-        'name = "floor"',
-        'name = "lamp surface"\nmaterial = "glow"\npolygon = [[-1, -1, 3], [-1, 1, 3], [1, 1, 3], [1, -1, 3]]',
-    )
+    lamp = 'name = "panel"\nmaterial = "glow"\npolygon = [[-1, -1, 3], [-1, 1, 3], [1, 1, 3], [1, -1, 3]]'
     text = room.read_text().replace(
         "[materials.mirror]", "[materials.glow]\nreflectance = 0\nemission = 3\n[materials.mirror]"
     )
@@ -125,7 +122,7 @@ def test_criteria_and_light_samples_reach_the_tracer(room, tmp_path):
     assert counts["normals"]["cast_rays_saved"] <= counts["plain"]["cast_rays_saved"]
     assert counts["normals"]["shadow_rays_saved"] < counts["plain"]["shadow_rays_saved"]
     assert counts["boundary"]["samples"] > counts["plain"]["samples"]
-    assert counts["rays"]["shadow_rays"] > 3 * counts["plain"]["shadow_rays"]
+    assert counts["rays"]["shadow_rays"] > 2 * counts["plain"]["shadow_rays"]
 
 
 def test_nff_lights_do_not_fall_off_and_the_width_scales_both_sides(tmp_path):
