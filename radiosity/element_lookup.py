@@ -292,7 +292,7 @@ class ElementLookup:
         return cls(root, frame, counts, cells, lists, listed_pieces, boxes[:made], links[:made], edges, starts, owner)
 
     @property
-    def lists_and_trees(self) -> tuple[np.ndarray, ...]:
+    def lists_and_trees(self) -> tuple[IntArray, IntArray, FloatArray, IntArray, IntArray, FloatArray]:
         """What :func:`search_list` takes after the list's number."""
         return self.lists, self.order, self.boxes, self.links, self.piece_start, self.edges
 

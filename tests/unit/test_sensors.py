@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from radiosity_scenes import cube_with_emitter
@@ -138,8 +140,8 @@ def test_emission_of_a_mesh_of_many_facets_is_counted_once():
     steps = np.linspace(0.2, 0.8, 11)
     quads = [
         np.array([[a, c, 1.0], [a, d, 1.0], [b, d, 1.0], [b, c, 1.0]])
-        for a, b in zip(steps, steps[1:], strict=False)
-        for c, d in zip(steps, steps[1:], strict=False)
+        for a, b in itertools.pairwise(steps)
+        for c, d in itertools.pairwise(steps)
     ]
     lamp = diffuse("lamp", 0.0, 1.0)
     room = box_surface("room", diffuse("wall", 0.5), [0, 0, 0], [1, 1, 1], inward=True, omit=["+z"])
