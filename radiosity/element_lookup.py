@@ -17,7 +17,7 @@ from radiosity.patches import PatchMesh
 from workbench.errors import InputError
 from workbench.geometry.flat import Geometry
 
-__all__ = ["ElementLookup", "element_gradients", "search_list"]
+__all__ = ["ElementLookup", "bounding_rectangle", "element_gradients", "search_list"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -210,6 +210,8 @@ class ElementLookup:
         Inward normal of the edge that each corner of the mesh begins, and its level.
     piece_start, piece_element
         Those of the mesh.
+    piece_polygon : (p,) int
+        Polygon of the geometry on which each piece of the mesh lies, also inside clusters.
     """
 
     root: IntArray
@@ -223,6 +225,7 @@ class ElementLookup:
     edges: FloatArray
     piece_start: IntArray
     piece_element: IntArray
+    piece_polygon: IntArray
 
     @classmethod
     def build(cls, geometry: Geometry, mesh: PatchMesh) -> ElementLookup:
@@ -248,7 +251,7 @@ class ElementLookup:
         single = many == 1
         root[groups[single] // 2, groups[single] % 2] = -2 - owner[by_key[first[single]]]
         if len(flat) < len(owner):
-            _clustered_facets(geometry, mesh, root)
+            polygon = _clustered_facets(geometry, mesh, root)
         groups, first, many = groups[~single], first[~single], many[~single]
         root[groups // 2, groups % 2] = np.arange(len(groups))
         starts = mesh.piece_start
@@ -289,7 +292,9 @@ class ElementLookup:
         lists[long, 2] = begin
         edges = np.empty((len(mesh.corners), 4))
         _inward_edges(mesh.corners, starts, mesh.piece_normal, edges)
-        return cls(root, frame, counts, cells, lists, listed_pieces, boxes[:made], links[:made], edges, starts, owner)
+        return cls(
+            root, frame, counts, cells, lists, listed_pieces, boxes[:made], links[:made], edges, starts, owner, polygon
+        )
 
     @property
     def lists_and_trees(self) -> tuple[IntArray, IntArray, FloatArray, IntArray, IntArray, FloatArray]:
@@ -315,18 +320,36 @@ class ElementLookup:
         return out
 
 
-def _grid_frame(mesh: PatchMesh, pieces: IntArray) -> tuple[FloatArray, tuple[int, int]]:
-    """Frame (8,) and counts of the grid over some pieces of one plane, along an edge of the first."""
+def _plane_extent(mesh: PatchMesh, pieces: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Axes (2, 3) in the plane of some pieces, along an edge of the first; their corners, and where each begins."""
     starts = mesh.piece_start
     first = mesh.corners[starts[pieces[0]] : starts[pieces[0] + 1]]
     sides = np.roll(first, -1, axis=0) - first
     u = sides[int(np.argmax((sides**2).sum(axis=1)))]
     u = u / np.linalg.norm(u)
-    v = np.cross(mesh.piece_normal[pieces[0]], u)
+    axes = np.stack([u, np.cross(mesh.piece_normal[pieces[0]], u)])
     sizes = starts[pieces + 1] - starts[pieces]
     begin = np.cumsum(sizes) - sizes
-    corners = mesh.corners[np.repeat(starts[pieces] - begin, sizes) + np.arange(sizes.sum())]
-    flat = corners @ np.stack([u, v]).T
+    return axes, mesh.corners[np.repeat(starts[pieces] - begin, sizes) + np.arange(sizes.sum())] @ axes.T, begin
+
+
+def bounding_rectangle(mesh: PatchMesh, pieces: IntArray) -> FloatArray:
+    """A rectangle (4, 3) round some pieces of one plane, in their direction."""
+    axes, flat, _ = _plane_extent(mesh, pieces)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    corner = mesh.corners[mesh.piece_start[pieces[0]]]
+    origin = corner - (corner @ axes.T) @ axes
+    return np.stack(
+        [
+            origin + a * axes[0] + b * axes[1]
+            for a, b in ((low[0], low[1]), (high[0], low[1]), tuple(high), (low[0], high[1]))
+        ]
+    )
+
+
+def _grid_frame(mesh: PatchMesh, pieces: IntArray) -> tuple[FloatArray, tuple[int, int]]:
+    """Frame (8,) and counts of the grid over some pieces of one plane, along an edge of the first."""
+    (u, v), flat, begin = _plane_extent(mesh, pieces)
     span = np.maximum.reduceat(flat, begin) - np.minimum.reduceat(flat, begin)
     low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
     extent = np.where(extent > 0, extent, 1.0)
@@ -374,8 +397,8 @@ def _facet_keys(corners: FloatArray, starts: IntArray, chosen: IntArray, width: 
     return keys.reshape(len(chosen), -1)
 
 
-def _clustered_facets(geometry: Geometry, mesh: PatchMesh, root: IntArray) -> None:
-    """Fill ``root`` for the facets of clusters: each piece is one, with the same corners."""
+def _clustered_facets(geometry: Geometry, mesh: PatchMesh, root: IntArray) -> IntArray:
+    """Fill ``root`` for the facets of clusters, whose pieces have the same corners; polygon of each piece."""
     owner = mesh.piece_element
     pieces = np.flatnonzero(mesh.element_polygon[owner] < 0)
     facets = np.flatnonzero((root[geometry.piece_polygon] == -1).all(axis=1))
@@ -395,6 +418,11 @@ def _clustered_facets(geometry: Geometry, mesh: PatchMesh, root: IntArray) -> No
         found = element_of[theirs]
         hit = found >= 0
         root[geometry.piece_polygon[facets[hit]], back] = -2 - found[hit]
+    facet_of = np.full(int(number.max()) + 1, -1, dtype=np.int64)
+    facet_of[theirs] = geometry.piece_polygon[facets]
+    polygon = mesh.element_polygon[owner].copy()
+    polygon[pieces] = facet_of[own]
+    return polygon
 
 
 @njit(nogil=True, cache=True)

@@ -12,20 +12,25 @@ import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radiosity._exact_gather import exact_gather
 from radiosity._gather_kernels import RUNS, collect_hits, gather_rays, net_bits
-from radiosity.element_lookup import ElementLookup, element_gradients
+from radiosity.element_lookup import ElementLookup, bounding_rectangle, element_gradients
+from radiosity.patches import PatchMesh
 from radiosity.solvers.solution import Solution
 from workbench.accel.embree import BLOCK_RAYS
 from workbench.arrays import as_points, as_unit_vectors
 from workbench.counters import Counters
+from workbench.culling.tally import BOX, CHECK, CLOSED, CUT, PIECES, add_tally, new_tally
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.shadow.lights import Sender, SphereLight, lights_of_scene
-from workbench.shadow.occlusion import Shader
+from workbench.shadow.occlusion import ROUNDING, Shader
 
 __all__ = ["Gatherer", "IrradianceEstimate"]
 
@@ -48,6 +53,18 @@ DIRECT_SHARE = 0.5
 """Share of the wanted error that sampled direct light may take."""
 
 
+COSTS = {BOX: 0.04, CHECK: 0.15, CLOSED: 0.6, CUT: 7.0, PIECES: 0.9}
+"""Costs by which a method is chosen, in units of a ray made, traced and read (0.15 us, measured)."""
+GROUP_COST = 1.2
+"""The same for one side of a polygon: its pyramid."""
+MOST_PIECES = 20_000
+"""Most pieces of elements that are gathered in closed form."""
+TRIAL = 32
+"""One point in so many is gathered in closed form to see what that costs."""
+CUT_LIMIT = 40
+"""Longest list of candidates that is cut at once; longer ones cut the element into parts."""
+
+
 @dataclass(frozen=True)
 class IrradianceEstimate:
     """Irradiance at n points.
@@ -63,7 +80,8 @@ class IrradianceEstimate:
         Harmonic mean distance of what the indirect light comes from, infinite where nothing is
         seen: the scale on which it changes. [scene lengths]
     method : str
-        How indirect light was gathered: ``"rays"`` or ``"none"`` (nothing is reflected).
+        How indirect light was gathered: ``"rays"``, ``"exact"`` (every element in closed form, cut by
+        what hides it) or ``"none"`` (nothing is reflected).
     counters : Counters
     seconds : dict
         Wall-clock seconds by stage.
@@ -119,6 +137,7 @@ class Gatherer:
         self.reflected = np.ascontiguousarray(solution.radiosity - np.where(asked[:, None], mesh.emission, 0.0))
         gradient = element_gradients(mesh, self.lookup, self.reflected)
         level = self.reflected - np.einsum("ebk,ek->eb", gradient, mesh.element_centroid)
+        self._sloped = gradient.any(axis=(1, 2))
         self._linear = np.ascontiguousarray(np.concatenate([gradient, level[..., None]], axis=2))
         first = self.geometry.piece_start[self.geometry.polygon_piece_start[:-1]]
         self._level = np.einsum("ij,ij->i", self.geometry.polygon_normal, self.geometry.corners[first])
@@ -183,12 +202,7 @@ class Gatherer:
         direct, direct_error = self._direct(place, facing, own_polygon, error, counters)
         seconds["direct"] = time.perf_counter() - begin
         begin = time.perf_counter()
-        method = "rays" if self.reflected.any() else "none"
-        if method == "rays":
-            indirect, doubt, distance = self._bundles(place, facing, direct, error, rays, counters)
-        else:
-            indirect, doubt = np.zeros_like(direct), np.zeros_like(direct)
-            distance = np.full(len(place), math.inf)
+        indirect, doubt, distance, method = self._indirect(place, facing, own_polygon, direct, error, rays, counters)
         seconds["indirect"] = time.perf_counter() - begin
         return IrradianceEstimate(
             direct + indirect, direct, indirect, np.hypot(direct_error, doubt), distance, method, counters, seconds
@@ -212,41 +226,99 @@ class Gatherer:
 
     # ---- indirect light -------------------------------------------------------------------------
 
-    def _bundles(
+    def _indirect(
         self,
         points: FloatArray,
         normals: FloatArray,
+        own: ArrayLike | None,
         direct: FloatArray,
         error: float,
         rays: int | None,
         counters: Counters,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Indirect irradiance by hemisphere bundles, its standard error, and the harmonic mean distance."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray, str]:
+        """Indirect irradiance, its standard error, the harmonic mean distance, and the method chosen."""
         n, bands = direct.shape
-        sums, reach = np.zeros((n, RUNS, bands)), np.zeros((n, 2))
-        everyone = np.arange(n)
-        count = np.full(n, PILOT_RAYS if rays is None else max(_power_of_two(rays), 2 * RUNS))
-        self._trace(points, normals, everyone, 0, int(count[0]), sums, reach, counters)
-        if rays is None:
-            mean, spread = _runs(sums, count)
-            level = (direct + mean).mean(axis=0)
-            allowed = math.sqrt(1.0 - DIRECT_SHARE**2) * error * level
-            # Of the bands, the one that is furthest from its error decides.
-            over = (spread / np.where(allowed > 0, allowed, math.inf)).max(axis=1)
-            wanted = np.minimum(PILOT_RAYS * np.maximum(over, 1.0) ** (4.0 / 3.0), MOST_RAYS)
-            target = 2 ** np.ceil(np.log2(wanted) - 1e-9).astype(np.int64)
-            for total in np.unique(target[target > PILOT_RAYS]).tolist():
-                rows = np.flatnonzero(target == total)
-                # The pilot's runs are the first rays of the longer net's first runs.
-                longer = np.zeros((len(rows), RUNS, bands))
-                for run in range(RUNS):
-                    longer[:, run * PILOT_RAYS // total] += sums[rows, run]
-                sums[rows] = longer
-                self._trace(points, normals, rows, PILOT_RAYS, total, sums, reach, counters)
-                count[rows] = total
-        mean, spread = _runs(sums, count)
-        distance = np.divide(reach[:, 1], reach[:, 0], out=np.full(n, math.inf), where=reach[:, 0] > 0)
-        return mean, spread, distance
+        if not self.reflected.any():
+            return np.zeros((n, bands)), np.zeros((n, bands)), np.full(n, math.inf), "none"
+        bundle = _Bundle(points, normals, np.zeros((n, RUNS, bands)), np.zeros((n, 2)), np.zeros(n, dtype=np.int64))
+        if rays is not None:
+            self._extend(bundle, np.arange(n), max(_power_of_two(rays), 2 * RUNS), counters)
+            return (*bundle.result(), bundle.distance(), "rays")
+        who = np.full(n, -1, dtype=np.int64) if own is None else np.broadcast_to(np.asarray(own, np.int64), (n,))
+        # Closed forms know no candidates yet: what they cost at least.
+        least = math.inf
+        lit: NDArray[np.bool_] = np.asarray(self.reflected.any(axis=1))
+        if np.count_nonzero(lit[self.lookup.piece_element]) <= MOST_PIECES:
+            least = GROUP_COST * self._exact.groups + COSTS[CLOSED] * self._exact.pieces
+        if least <= PILOT_RAYS:
+            self._extend(bundle, np.arange(n), 4 * RUNS, counters)
+            return (*self._closed_forms(points, normals, who, np.arange(n), counters)[:2], bundle.distance(), "exact")
+        self._extend(bundle, np.arange(n), PILOT_RAYS, counters)
+        mean, spread = bundle.result()
+        level = (direct + mean).mean(axis=0)
+        allowed = math.sqrt(1.0 - DIRECT_SHARE**2) * error * level
+        # Of the bands, the one that is furthest from its error decides.
+        over = (spread / np.where(allowed > 0, allowed, math.inf)).max(axis=1)
+        target = 2 ** np.ceil(np.log2(PILOT_RAYS * np.maximum(over, 1.0) ** (4.0 / 3.0)) - 1e-9)
+        if least * n < target.sum() - PILOT_RAYS * n:
+            trial = np.arange(0, n, TRIAL)
+            value, doubt, cost = self._closed_forms(points, normals, who, trial, counters)
+            if cost / len(trial) * n < target.sum() - PILOT_RAYS * n:
+                rest = np.setdiff1d(np.arange(n), trial)
+                other = self._closed_forms(points, normals, who, rest, counters)
+                return value + other[0], doubt + other[1], bundle.distance(), "exact"
+        for total in np.unique(target[target > PILOT_RAYS]).tolist():
+            self._extend(bundle, np.flatnonzero(target == total), int(min(total, MOST_RAYS)), counters)
+        return (*bundle.result(), bundle.distance(), "rays")
+
+    @cached_property
+    def _exact(self) -> _Groups:
+        """The elements' pieces by side of a polygon, for closed forms."""
+        return _Groups.build(self.solution.mesh, self.lookup, self.reflected)
+
+    def _closed_forms(
+        self, points: FloatArray, normals: FloatArray, own: IntArray, rows: IntArray, counters: Counters
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Irradiance of ``rows`` by every element in closed form (others 0), its doubt, and the cost in rays."""
+        geo, mesh, parts = self.geometry, self.solution.mesh, self._exact
+        through = geo.polygon_transmittance[geo.piece_polygon]
+        out, doubt = np.zeros((len(points), self.reflected.shape[1])), np.zeros((len(points), self.reflected.shape[1]))
+        slack = max(geo.slack, ROUNDING * float(np.abs(points).max()))
+        everything = np.arange(parts.groups)
+
+        def work(block: IntArray) -> NDArray[np.int64]:
+            tally = new_tally()
+            exact_gather(
+                points, normals, own, block, everything, parts.rings, parts.polygon, parts.normal, parts.members,
+                parts.start, mesh.corners, mesh.piece_start, mesh.piece_normal, mesh.piece_element, self._linear,
+                self._sloped, geo.corners, geo.piece_start, geo.piece_polygon, through, *self.shader.tree,
+                slack, CUT_LIMIT, out, doubt, tally,
+            )  # fmt: skip
+            return tally
+
+        blocks = np.array_split(rows, max(1, len(rows) // 16)) if len(rows) else []
+        if self.workers > 1 and len(blocks) > 1:
+            with ThreadPoolExecutor(self.workers) as pool:
+                done = list(pool.map(work, blocks))
+        else:
+            done = [work(block) for block in blocks]
+        cost = GROUP_COST * parts.groups * len(rows)
+        for tally in done:
+            add_tally(counters, tally)
+            cost += sum(each * int(tally[row]) for row, each in COSTS.items())
+        return out, doubt, cost
+
+    def _extend(self, bundle: _Bundle, rows: IntArray, count: int, counters: Counters) -> None:
+        """Shoot the rays of some bundles up to ``count``, a power of two."""
+        before = int(bundle.count[rows[0]])
+        if before:
+            # The runs so far are the first rays of the longer net's first runs.
+            longer = np.zeros((len(rows), *bundle.sums.shape[1:]))
+            for run in range(RUNS):
+                longer[:, run * before // count] += bundle.sums[rows, run]
+            bundle.sums[rows] = longer
+        self._trace(bundle.points, bundle.normals, rows, before, count, bundle.sums, bundle.reach, counters)
+        bundle.count[rows] = count
 
     def _trace(
         self,
@@ -310,15 +382,69 @@ def _power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def _runs(sums: FloatArray, count: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Mean of each point's bundle and its standard error, from the spread of the runs.
+@dataclass
+class _Bundle:
+    """Bundles of n points and what their rays found so far."""
 
-    Four runs tell an error but roughly, so each point's counts together with the mean of all.
+    points: FloatArray
+    normals: FloatArray
+    sums: FloatArray
+    reach: FloatArray
+    count: IntArray
+
+    def result(self) -> tuple[FloatArray, FloatArray]:
+        """Mean of each bundle and its standard error, from the spread of the runs.
+
+        Four runs tell an error but roughly, so each point's counts together with the mean of all.
+        """
+        count = self.count[:, None]
+        mean = self.sums.sum(axis=1) / count
+        each = self.sums * (RUNS / count[..., None])
+        square = ((each - mean[:, None]) ** 2).sum(axis=1) / (RUNS * (RUNS - 1.0))
+        # Points with other numbers of rays differ: what they share is the spread at one ray's count.
+        common = count**1.5
+        pooled = (square * common).mean(axis=0) / common
+        return mean, NET_GAIN * np.sqrt((POOL * pooled + (RUNS - 1.0) * square) / (POOL + RUNS - 1.0))
+
+    def distance(self) -> FloatArray:
+        """Harmonic mean distance of the hits, infinite where nothing was met."""
+        inverse, hits = self.reach[:, 0], self.reach[:, 1]
+        return np.where(inverse > 0, hits / np.where(inverse > 0, inverse, 1.0), math.inf)
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Pieces of elements that send light, by side of a polygon.
+
+    ``rings`` (g, 4, 3) are rectangles round each group, ``polygon``, ``normal`` its polygon and the
+    normal of its side, ``members[start[i]:start[i + 1]]`` its pieces of the mesh.
     """
-    mean = sums.sum(axis=1) / count[:, None]
-    each = sums * (RUNS / count[:, None, None])
-    square = ((each - mean[:, None]) ** 2).sum(axis=1) / (RUNS * (RUNS - 1.0))
-    # Points with other numbers of rays differ: what they share is the spread at one ray's count.
-    common = count[:, None] ** 1.5
-    pooled = (square * common).mean(axis=0) / common
-    return mean, NET_GAIN * np.sqrt((POOL * pooled + (RUNS - 1.0) * square) / (POOL + RUNS - 1.0))
+
+    rings: FloatArray
+    polygon: IntArray
+    normal: FloatArray
+    members: IntArray
+    start: IntArray
+
+    @property
+    def groups(self) -> int:
+        return len(self.polygon)
+
+    @property
+    def pieces(self) -> int:
+        return len(self.members)
+
+    @classmethod
+    def build(cls, mesh: PatchMesh, lookup: ElementLookup, values: FloatArray) -> _Groups:
+        lit: NDArray[np.bool_] = np.asarray(values.any(axis=1))
+        pieces = np.flatnonzero(lit[mesh.piece_element])
+        key = lookup.piece_polygon[pieces] * 2 + (mesh.element_side[mesh.piece_element[pieces]] < 0)
+        order = np.argsort(key, kind="stable")
+        members = pieces[order]
+        groups, first = np.unique(key[order], return_index=True)
+        start = np.append(first, len(members)).astype(np.int64)
+        rings = np.stack([bounding_rectangle(mesh, members[a:b]) for a, b in pairwise(start.tolist())])
+        return cls(
+            np.ascontiguousarray(rings), groups // 2, np.ascontiguousarray(mesh.piece_normal[members[first]]), members,
+            start,
+        )  # fmt: skip

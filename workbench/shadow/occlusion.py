@@ -317,6 +317,11 @@ class Shader:
         """Embree, for rays past opaque surfaces."""
         return EmbreeAccelerator(self.geometry)
 
+    @property
+    def tree(self) -> tuple[FloatArray, FloatArray, IntArray, IntArray, IntArray, IntArray, FloatArray]:
+        """What :func:`workbench.accel.box_tree.boxes_meeting_planes` takes first: the box tree's arrays."""
+        return self._tree
+
     @cached_property
     def grid(self) -> VoxelGrid:
         """The instrument's voxels, for counted rays and for panes; a pane has one transmittance, its mean."""
