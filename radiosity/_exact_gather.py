@@ -16,9 +16,10 @@ from workbench.shadow.area import MAX_CORNERS, MAX_PIECES
 
 MOST_CANDIDATES = 64
 """Longest candidate list of one point and one polygon; beyond it each piece asks the tree."""
-NEAR = 1.5
-"""A cell nearer than this many of its own extents is quartered, where its radiosity has a slope."""
-DEEPEST = 4
+PARTLY, WHOLLY = 0.3, 0.1
+"""Share of a cell's contrast by which its mean may be off where only part of it is seen; where all is
+seen, times (extent / distance)^2 (measured)."""
+DEEPEST = 5
 """Most quarterings of a cell."""
 
 
@@ -65,13 +66,14 @@ def _toward_the_weight(x, y, z, nx, ny, nz, mx, my, mz, cell, corners, extent, c
 def exact_gather(
     points, normals, own, rows, groups, rings, group_polygon, group_normal, group_pieces, group_start, mesh_corners,
     mesh_starts, mesh_normals, piece_element, linear, sloped, corners, starts, piece_polygon, through, low, high, skip,
-    head, leaf, order, bounds, slack, limit, out, doubt, tally,
+    head, leaf, order, bounds, slack, limit, allowed, out, doubt, tally,
 ):  # fmt: skip
     """Irradiance of points ``rows`` by the pieces of the groups' elements, in closed form.
 
     A group is one side of a polygon: ``rings`` (g, 4, 3) a rectangle round it, ``group_pieces`` its
     pieces by ``group_start``.  The light pyramid to the rectangle finds what may hide any of them.
-    ``linear`` is as in ``collect_hits``; elements in ``sloped`` are quartered near the point.
+    ``linear`` is as in ``collect_hits``; elements in ``sloped`` are quartered where one place of a cell
+    may stand for it by more than ``allowed`` (bands,) badly.
     ``out`` and ``doubt`` (points, bands) get irradiance and what crowded cuts leave open of it.
     """
     planes = np.empty((2 * MAX_CORNERS + 6, 4))
@@ -136,6 +138,8 @@ def exact_gather(
                     if sloped[element]:
                         quad = _first_cell(mesh_corners, a, b, k, cells[0])
                         depth[0], top = 0, 0
+                    whole = extent = away = 0.0
+                    n = 0
                     while True:
                         # A whole piece, or the cell on the top of the stack.
                         cx = cy = cz = 0.0
@@ -157,16 +161,6 @@ def exact_gather(
                                     abs(cells[top, 3 if quad else 1, axis] - cells[top, 1 if quad else 0, axis]),
                                 )  # fmt: skip
                             away = math.sqrt((cx - x) ** 2 + (cy - y) ** 2 + (cz - z) ** 2)
-                            if away < NEAR * extent and depth[top] < DEEPEST:
-                                level = depth[top]
-                                for c in range(4):
-                                    for axis in range(3):
-                                        parent[c, axis] = cells[top, c, axis]
-                                for q in range(4):
-                                    _child(parent, quad, q, cells[top + q])
-                                    depth[top + q] = level + 1
-                                top += 3
-                                continue
                             centre[0], centre[1], centre[2] = cx, cy, cz
                             _toward_the_weight(x, y, z, nx, ny, nz, mx, my, mz, cells[top], n, extent, centre)
                             cx, cy, cz = centre[0], centre[1], centre[2]
@@ -181,8 +175,9 @@ def exact_gather(
                                     x, y, z, nx, ny, nz, cells[top], 0, 4 if quad else 3, cell_normal, 0, slack
                                 )
                             share = max(share, 0.0)
+                            whole = share
                         elif count > 0 and top < 0:
-                            share, _ = _point_share(
+                            share, whole = _point_share(
                                 x, y, z, nx, ny, nz, own[i], other, p, p + 1, mesh_corners, mesh_starts, mesh_normals,
                                 corners, starts, piece_polygon, through, slack, found, count, limit, planes, picked,
                                 boxes, sizes, weights, cut, tally,
@@ -190,13 +185,43 @@ def exact_gather(
                         elif count > 0:
                             cell_normal[0] = group_normal[g]
                             cell_start[1] = 4 if quad else 3
-                            share, _ = _point_share(
+                            share, whole = _point_share(
                                 x, y, z, nx, ny, nz, own[i], other, 0, 1, cells[top], cell_start, cell_normal,
                                 corners, starts, piece_polygon, through, slack, found, count, limit, planes, picked,
                                 boxes, sizes, weights, cut, tally,
                             )  # fmt: skip
                         else:
                             share = NEEDS_RAYS
+                        if top >= 0 and whole > 0.0 and share != 0.0 and depth[top] < DEEPEST:
+                            lowest = math.inf
+                            for c in range(n):
+                                lowest = min(
+                                    lowest,
+                                    nx * (cells[top, c, 0] - x) + ny * (cells[top, c, 1] - y)
+                                    + nz * (cells[top, c, 2] - z),
+                                )  # fmt: skip
+                            off = whole * extent
+                            if share < 0.999 * whole or lowest < 0.0:
+                                off *= PARTLY
+                            else:
+                                off *= min(WHOLLY * (extent / away) ** 2, PARTLY)
+                            rough = False
+                            for band in range(allowed.shape[0]):
+                                slope = math.sqrt(
+                                    linear[element, band, 0] ** 2 + linear[element, band, 1] ** 2
+                                    + linear[element, band, 2] ** 2
+                                )  # fmt: skip
+                                rough = rough or off * slope > allowed[band]
+                            if rough:
+                                level = depth[top]
+                                for c in range(4):
+                                    for axis in range(3):
+                                        parent[c, axis] = cells[top, c, axis]
+                                for q in range(4):
+                                    _child(parent, quad, q, cells[top + q])
+                                    depth[top + q] = level + 1
+                                top += 3
+                                continue
                         if share < 0.0:
                             one[0] = i
                             if top < 0:

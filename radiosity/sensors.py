@@ -59,6 +59,8 @@ GROUP_COST = 1.2
 """The same for one side of a polygon: its pyramid."""
 MOST_PIECES = 20_000
 """Most pieces of elements that are gathered in closed form."""
+CELL_SHARE = 0.01
+"""Share of the wanted error that one cell of an element may take where its radiosity has a slope."""
 TRIAL = 32
 """One point in so many is gathered in closed form to see what that costs."""
 CUT_LIMIT = 40
@@ -252,7 +254,9 @@ class Gatherer:
             least = GROUP_COST * self._exact.groups + COSTS[CLOSED] * self._exact.pieces
         if least <= PILOT_RAYS:
             self._extend(bundle, np.arange(n), 4 * RUNS, counters)
-            return (*self._closed_forms(points, normals, who, np.arange(n), counters)[:2], bundle.distance(), "exact")
+            small = CELL_SHARE * error * (direct + bundle.result()[0]).mean(axis=0)
+            value, doubt, _ = self._closed_forms(points, normals, who, np.arange(n), small, counters)
+            return value, doubt, bundle.distance(), "exact"
         self._extend(bundle, np.arange(n), PILOT_RAYS, counters)
         mean, spread = bundle.result()
         level = (direct + mean).mean(axis=0)
@@ -262,10 +266,10 @@ class Gatherer:
         target = 2 ** np.ceil(np.log2(PILOT_RAYS * np.maximum(over, 1.0) ** (4.0 / 3.0)) - 1e-9)
         if least * n < target.sum() - PILOT_RAYS * n:
             trial = np.arange(0, n, TRIAL)
-            value, doubt, cost = self._closed_forms(points, normals, who, trial, counters)
+            value, doubt, cost = self._closed_forms(points, normals, who, trial, CELL_SHARE * error * level, counters)
             if cost / len(trial) * n < target.sum() - PILOT_RAYS * n:
                 rest = np.setdiff1d(np.arange(n), trial)
-                other = self._closed_forms(points, normals, who, rest, counters)
+                other = self._closed_forms(points, normals, who, rest, CELL_SHARE * error * level, counters)
                 return value + other[0], doubt + other[1], bundle.distance(), "exact"
         for total in np.unique(target[target > PILOT_RAYS]).tolist():
             self._extend(bundle, np.flatnonzero(target == total), int(min(total, MOST_RAYS)), counters)
@@ -277,9 +281,18 @@ class Gatherer:
         return _Groups.build(self.solution.mesh, self.lookup, self.reflected)
 
     def _closed_forms(
-        self, points: FloatArray, normals: FloatArray, own: IntArray, rows: IntArray, counters: Counters
+        self,
+        points: FloatArray,
+        normals: FloatArray,
+        own: IntArray,
+        rows: IntArray,
+        small: FloatArray,
+        counters: Counters,
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Irradiance of ``rows`` by every element in closed form (others 0), its doubt, and the cost in rays."""
+        """Irradiance of ``rows`` by every element in closed form (others 0), its doubt, and the cost in rays.
+
+        ``small`` (bands,) is what one place that stands for a cell may be off by. [W m-2]
+        """
         geo, mesh, parts = self.geometry, self.solution.mesh, self._exact
         through = geo.polygon_transmittance[geo.piece_polygon]
         out, doubt = np.zeros((len(points), self.reflected.shape[1])), np.zeros((len(points), self.reflected.shape[1]))
@@ -292,7 +305,7 @@ class Gatherer:
                 points, normals, own, block, everything, parts.rings, parts.polygon, parts.normal, parts.members,
                 parts.start, mesh.corners, mesh.piece_start, mesh.piece_normal, mesh.piece_element, self._linear,
                 self._sloped, geo.corners, geo.piece_start, geo.piece_polygon, through, *self.shader.tree,
-                slack, CUT_LIMIT, out, doubt, tally,
+                slack, CUT_LIMIT, small, out, doubt, tally,
             )  # fmt: skip
             return tally
 
