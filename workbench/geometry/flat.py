@@ -14,13 +14,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.errors import InputError, SceneError
-from workbench.geometry.polygons import convex_pieces, fan_triangles, vector_area
-from workbench.scene.model import Material, Scene
+from workbench.geometry.polygons import are_convex, convex_pieces, fan_triangles, vector_area
+from workbench.scene.model import Material, Scene, Surface
 
 __all__ = ["Geometry"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+
+def _convex_mesh(surface: Surface) -> tuple[FloatArray, FloatArray] | None:
+    """Corners (f, n, 3) and vector areas (f, 3) of a mesh of triangles or convex quads: nothing to cut."""
+    count, ring_sizes = surface.face_count, np.diff(surface.ring_offsets)
+    if not count or len(ring_sizes) != count or ring_sizes[0] not in (3, 4) or (ring_sizes != ring_sizes[0]).any():
+        return None
+    corners = surface.vertices[surface.ring_vertices].reshape(count, -1, 3)
+    from_first = corners[:, 1:] - corners[:, :1]
+    vectors = 0.5 * np.cross(from_first[:, :-1], from_first[:, 1:]).sum(axis=1)
+    if ring_sizes[0] == 3:
+        return corners, vectors
+    area = np.linalg.norm(vectors, axis=1)
+    convex = (area > 0) & are_convex(corners, vectors / np.where(area > 0, area, 1.0)[:, None])
+    return (corners, vectors) if convex.all() else None
 
 
 @dataclass(frozen=True)
@@ -132,15 +147,12 @@ class Geometry:
         polygons = 0
         for index, surface in enumerate(scene.surfaces):
             count = surface.face_count
-            ring_sizes = np.diff(surface.ring_offsets)
-            if count and len(ring_sizes) == count and (ring_sizes == 3).all():
-                # Whole triangle meshes at once: nothing to cut.
-                points = surface.vertices[surface.ring_vertices]
-                tri = points.reshape(count, 3, 3)
-                corners.append(points)
-                sizes.append(np.full(count, 3))
+            whole = _convex_mesh(surface)
+            if whole is not None:
+                corners.append(whole[0].reshape(-1, 3))
+                sizes.append(np.full(count, whole[0].shape[1]))
                 piece_polygon.append(np.arange(polygons, polygons + count))
-                vectors.append(0.5 * np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0]))
+                vectors.append(whole[1])
             else:
                 for face, rings in enumerate(surface.faces()):
                     try:

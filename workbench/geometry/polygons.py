@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from workbench.errors import InputError
 
-__all__ = ["check_polygon", "convex_pieces", "fan_triangles", "is_convex", "plane_basis", "vector_area"]
+__all__ = ["are_convex", "check_polygon", "convex_pieces", "fan_triangles", "is_convex", "plane_basis", "vector_area"]
 
 FloatArray = NDArray[np.float64]
 
@@ -42,16 +42,24 @@ def plane_basis(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     return u, np.cross(normal, u)
 
 
-def is_convex(ring: FloatArray, normal: FloatArray) -> bool:
-    """Whether a ring (n, 3) turns the same way at each corner; collinear corners are allowed."""
-    edge = np.roll(ring, -1, axis=0) - ring
-    turn = np.cross(edge, np.roll(edge, -1, axis=0)) @ normal
-    length = np.linalg.norm(edge, axis=1)
-    if (turn < -1e-12 * length * np.roll(length, -1)).any():
-        return False
+def are_convex(rings: FloatArray, normals: FloatArray) -> NDArray[np.bool_]:
+    """Whether each ring of (f, n, 3) turns the same way at each corner; collinear corners are allowed.
+
+    ``normals`` (f, 3) point to where the rings go counter-clockwise.
+    """
+    edge = np.roll(rings, -1, axis=1) - rings
+    following = np.roll(edge, -1, axis=1)
+    turn = np.einsum("fnj,fj->fn", np.cross(edge, following), normals)
+    length = np.linalg.norm(edge, axis=2)
+    left = (turn >= -1e-12 * length * np.roll(length, -1, axis=1)).all(axis=1)
     # All turns to the left but more than one full turn (a pentagram) is not convex either.
-    angle = np.arctan2(turn, np.einsum("ij,ij->i", edge, np.roll(edge, -1, axis=0)))
-    return bool(abs(angle.sum() - 2 * np.pi) < 1e-6)
+    angle = np.arctan2(turn, np.einsum("fnj,fnj->fn", edge, following)).sum(axis=1)
+    return left & (np.abs(angle - 2 * np.pi) < 1e-6)
+
+
+def is_convex(ring: FloatArray, normal: FloatArray) -> bool:
+    """Whether a ring (n, 3) turns the same way at each corner, see :func:`are_convex`."""
+    return bool(are_convex(ring[None], np.asarray(normal)[None])[0])
 
 
 def check_polygon(rings: Sequence[FloatArray]) -> str | None:
