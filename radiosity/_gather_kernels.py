@@ -9,6 +9,7 @@ from numba import njit
 
 from radiosity.element_lookup import search_list
 from workbench.sampling.sequences import hashed, owen_scramble
+from workbench.shadow._sky import relative_radiance
 
 RUNS = 4
 """Blocks of one point's rays that are told apart: each is a net of its own, their spread tells the error."""
@@ -83,11 +84,14 @@ def gather_rays(
 @njit(nogil=True, cache=True)
 def collect_hits(
     origins, directions, owner, run, weight, polygon, measure, centre, scale, polygon_normal, polygon_level, through,
-    root, frame, counts, cells, lists, order, boxes, links, starts, edges, piece_element, linear, sums, reach, passed,
+    root, frame, counts, cells, lists, order, boxes, links, starts, edges, piece_element, linear, law,
+    open_sky, sums, reach, seen, passed,
 ):  # fmt: skip
     """Add what the hits of rays send back to ``sums`` (points, runs, bands); the number of rays past a pane.
 
     ``linear`` (elements, bands, 4) gives the radiosity at (x, y, z) as ``a x + b y + c z + d``.
+    ``seen`` (points, runs, 2) gets, if ``open_sky``, what rays that miss everything see of the sky of
+    ``law`` (irradiance for a zenith radiance of 1) and of the ground (form factor).
     ``reach`` (points, 2) gets the sum of 1 / distance and the number of hits, if ``measure``.
     ``passed`` gets the position, the weight and the distance of rays that go on through a pane.
     """
@@ -95,9 +99,14 @@ def collect_hits(
     bands = linear.shape[1]
     for k in range(polygon.shape[0]):
         p = polygon[k]
-        if p < 0:
-            continue
         dx, dy, dz = np.float64(directions[k, 0]), np.float64(directions[k, 1]), np.float64(directions[k, 2])
+        if p < 0:
+            if open_sky:
+                if law[0] * dx + law[1] * dy + law[2] * dz > 0.0:
+                    seen[owner[k], run[k], 0] += weight[k] * math.pi * relative_radiance(dx, dy, dz, law)
+                else:
+                    seen[owner[k], run[k], 1] += weight[k]
+            continue
         ox = np.float64(origins[k, 0]) / scale + centre[0]
         oy = np.float64(origins[k, 1]) / scale + centre[1]
         oz = np.float64(origins[k, 2]) / scale + centre[2]

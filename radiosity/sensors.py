@@ -1,7 +1,7 @@
 """Irradiance at points from a solution: solve coarse, gather fine.
 
-Direct light (emitting surfaces, lights without surface) is found at each point through the shadow
-module, exactly where it can be, and never read from the mesh.  Indirect light is gathered from the
+Direct light (emitting surfaces, lights without surface, the sky) is found at each point through the
+shadow module, exactly where it can be, and never read from the mesh.  Indirect light is gathered from the
 radiosity that the solution's elements reflect: by hemisphere bundles of cosine-equal quasi-random
 rays whose hits read the solution, or in closed form over all elements where they are few.
 """
@@ -31,6 +31,7 @@ from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.shadow.lights import Sender, SphereLight, lights_of_scene
 from workbench.shadow.occlusion import ROUNDING, Shader
+from workbench.shadow.sky import SkyLight
 
 __all__ = ["Gatherer", "IrradianceEstimate"]
 
@@ -134,6 +135,7 @@ class Gatherer:
             if surface.face_count > MOST_LIGHTS and surface.sphere is None
         }
         self.lights = tuple(self._lights(gathered))
+        self.sky = SkyLight.of_scene(scene)
         asked = ~np.isin(mesh.element_surface, list(gathered))
         # What rays read: reflected light, and the emission of meshes with too many facets to ask each.
         self.reflected = np.ascontiguousarray(solution.radiosity - np.where(asked[:, None], mesh.emission, 0.0))
@@ -201,10 +203,13 @@ class Gatherer:
             raise OptionError(f"rays: found {rays}, expected 1 to {MOST_RAYS}")
         counters, seconds = Counters(), {}
         begin = time.perf_counter()
-        direct, direct_error = self._direct(place, facing, own_polygon, error, counters)
+        direct, direct_error, crowded = self._direct(place, facing, own_polygon, error, counters)
         seconds["direct"] = time.perf_counter() - begin
         begin = time.perf_counter()
-        indirect, doubt, distance, method = self._indirect(place, facing, own_polygon, direct, error, rays, counters)
+        indirect, doubt, distance, method, from_sky = self._indirect(
+            place, facing, own_polygon, direct, crowded, error, rays, counters
+        )
+        direct = direct + from_sky
         seconds["indirect"] = time.perf_counter() - begin
         return IrradianceEstimate(
             direct + indirect, direct, indirect, np.hypot(direct_error, doubt), distance, method, counters, seconds
@@ -214,17 +219,25 @@ class Gatherer:
 
     def _direct(
         self, points: FloatArray, normals: FloatArray, own: ArrayLike | None, error: float, counters: Counters
-    ) -> tuple[FloatArray, FloatArray]:
-        """Irradiance straight from the lights, and its standard error."""
-        bands = self.reflected.shape[1]
-        if not self.lights:
-            return np.zeros((len(points), bands)), np.zeros((len(points), bands))
-        found = self.shader.estimate(
-            points, normals, self.lights, "auto", error=DIRECT_SHARE * error, seed=self.seed, own_polygon=own
-        )
-        counters.merge(found.counters)
-        shape = (len(points), bands)
-        return np.broadcast_to(found.irradiance, shape).copy(), np.broadcast_to(found.standard_error, shape).copy()
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Irradiance straight from lights and sky, its standard error, and where the sky is left to rays."""
+        shape = (len(points), self.reflected.shape[1])
+        value, doubt, crowded = np.zeros(shape), np.zeros(shape), np.zeros(len(points), dtype=bool)
+        if self.lights:
+            found = self.shader.estimate(
+                points, normals, self.lights, "auto", error=DIRECT_SHARE * error, seed=self.seed, own_polygon=own
+            )
+            counters.merge(found.counters)
+            value += found.irradiance
+            doubt += found.standard_error
+        if self.sky is not None:
+            shares = self.sky.shares(
+                self.shader, points, normals, own_polygon=own, error=DIRECT_SHARE * error, counters=counters
+            )
+            crowded = np.isnan(shares[:, 0])
+            shares[crowded] = 0.0
+            value += self.sky.irradiance(shares)
+        return value, doubt, crowded
 
     # ---- indirect light -------------------------------------------------------------------------
 
@@ -234,32 +247,44 @@ class Gatherer:
         normals: FloatArray,
         own: ArrayLike | None,
         direct: FloatArray,
+        crowded: NDArray[np.bool_],
         error: float,
         rays: int | None,
         counters: Counters,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, str]:
-        """Indirect irradiance, its standard error, the harmonic mean distance, and the method chosen."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray, str, FloatArray]:
+        """Indirect irradiance, its standard error, harmonic mean distance, the method chosen, and sky seen by rays."""
         n, bands = direct.shape
-        if not self.reflected.any():
-            return np.zeros((n, bands)), np.zeros((n, bands)), np.full(n, math.inf), "none"
-        bundle = _Bundle(points, normals, np.zeros((n, RUNS, bands)), np.zeros((n, 2)), np.zeros(n, dtype=np.int64))
+        nothing = np.zeros((n, bands))
+        if not self.reflected.any() and not crowded.any():
+            return nothing, nothing.copy(), np.full(n, math.inf), "none", nothing
+        bundle = _Bundle(
+            points,
+            normals,
+            np.zeros((n, RUNS, bands)),
+            np.zeros((n, RUNS, 2)),
+            np.zeros((n, 2)),
+            np.zeros(n, dtype=np.int64),
+            self.sky if crowded.any() else None,
+            crowded,
+        )
         if rays is not None:
             self._extend(bundle, np.arange(n), max(_power_of_two(rays), 2 * RUNS), counters)
-            return (*bundle.result(), bundle.distance(), "rays")
+            mean, spread, from_sky = bundle.result()
+            return mean, spread, bundle.distance(), "rays", from_sky
         who = np.full(n, -1, dtype=np.int64) if own is None else np.broadcast_to(np.asarray(own, np.int64), (n,))
         # Closed forms know no candidates yet: what they cost at least.
         least = math.inf
         lit: NDArray[np.bool_] = np.asarray(self.reflected.any(axis=1))
-        if np.count_nonzero(lit[self.lookup.piece_element]) <= MOST_PIECES:
+        if not crowded.any() and np.count_nonzero(lit[self.lookup.piece_element]) <= MOST_PIECES:
             least = GROUP_COST * self._exact.groups + COSTS[CLOSED] * self._exact.pieces
         if least <= PILOT_RAYS:
             self._extend(bundle, np.arange(n), 4 * RUNS, counters)
             small = CELL_SHARE * error * (direct + bundle.result()[0]).mean(axis=0)
             value, doubt, _ = self._closed_forms(points, normals, who, np.arange(n), small, counters)
-            return value, doubt, bundle.distance(), "exact"
+            return value, doubt, bundle.distance(), "exact", nothing
         self._extend(bundle, np.arange(n), PILOT_RAYS, counters)
-        mean, spread = bundle.result()
-        level = (direct + mean).mean(axis=0)
+        mean, spread, from_sky = bundle.result()
+        level = (direct + mean + from_sky).mean(axis=0)
         allowed = math.sqrt(1.0 - DIRECT_SHARE**2) * error * level
         # Of the bands, the one that is furthest from its error decides.
         over = (spread / np.where(allowed > 0, allowed, math.inf)).max(axis=1)
@@ -270,10 +295,11 @@ class Gatherer:
             if cost / len(trial) * n < target.sum() - PILOT_RAYS * n:
                 rest = np.setdiff1d(np.arange(n), trial)
                 other = self._closed_forms(points, normals, who, rest, CELL_SHARE * error * level, counters)
-                return value + other[0], doubt + other[1], bundle.distance(), "exact"
+                return value + other[0], doubt + other[1], bundle.distance(), "exact", nothing
         for total in np.unique(target[target > PILOT_RAYS]).tolist():
             self._extend(bundle, np.flatnonzero(target == total), int(min(total, MOST_RAYS)), counters)
-        return (*bundle.result(), bundle.distance(), "rays")
+        mean, spread, from_sky = bundle.result()
+        return mean, spread, bundle.distance(), "rays", from_sky
 
     @cached_property
     def _exact(self) -> _Groups:
@@ -326,27 +352,19 @@ class Gatherer:
         before = int(bundle.count[rows[0]])
         if before:
             # The runs so far are the first rays of the longer net's first runs.
-            longer = np.zeros((len(rows), *bundle.sums.shape[1:]))
-            for run in range(RUNS):
-                longer[:, run * before // count] += bundle.sums[rows, run]
-            bundle.sums[rows] = longer
-        self._trace(bundle.points, bundle.normals, rows, before, count, bundle.sums, bundle.reach, counters)
+            for sums in (bundle.sums, bundle.seen):
+                longer = np.zeros((len(rows), *sums.shape[1:]))
+                for run in range(RUNS):
+                    longer[:, run * before // count] += sums[rows, run]
+                sums[rows] = longer
+        self._trace(bundle, rows, before, count, counters)
         bundle.count[rows] = count
 
-    def _trace(
-        self,
-        points: FloatArray,
-        normals: FloatArray,
-        rows: IntArray,
-        first: int,
-        count: int,
-        sums: FloatArray,
-        reach: FloatArray,
-        counters: Counters,
-    ) -> None:
+    def _trace(self, bundle: _Bundle, rows: IntArray, first: int, count: int, counters: Counters) -> None:
         """Shoot rays ``first..count`` of the bundles of some points, block by block over the threads."""
         tracer, geometry, mesh = self.shader.tracer, self.geometry, self.solution.mesh
         centre, scale = tracer.frame
+        law = bundle.sky.law if bundle.sky is not None else np.zeros(12)
         bits = net_bits(count)
         share = max(1, BLOCK_RAYS // (count - first))
         blocks = [rows[i : i + share] for i in range(0, len(rows), share)]
@@ -356,11 +374,12 @@ class Gatherer:
             origins, directions = np.empty((many, 3), np.float32), np.empty((many, 3), np.float32)
             owner, run = np.empty(many, dtype=np.int32), np.empty(many, dtype=np.int32)
             gather_rays(
-                points, normals, block, bits, first, count, count, self.seed, tracer.offset, centre, scale, origins,
-                directions, owner, run,
+                bundle.points, bundle.normals, block, bits, first, count, count, self.seed, tracer.offset, centre,
+                scale, origins, directions, owner, run,
             )  # fmt: skip
             weight = np.ones(many)
-            part, near = np.zeros((len(block), RUNS, sums.shape[2])), np.zeros((len(block), 2))
+            part, near = np.zeros((len(block), RUNS, bundle.sums.shape[2])), np.zeros((len(block), 2))
+            seen = np.zeros((len(block), RUNS, 2))
             traced = hits = 0
             for depth in range(MOST_PANES + 1):
                 polygon = tracer.nearest_raw(origins, directions)
@@ -370,7 +389,7 @@ class Gatherer:
                     origins, directions, owner, run, weight, polygon, first == 0 and depth == 0, centre, scale,
                     geometry.polygon_normal, self._level, geometry.polygon_transmittance, self.lookup.root,
                     self.lookup.frame, self.lookup.counts, self.lookup.cells, *self.lookup.lists_and_trees,
-                    mesh.piece_element, self._linear, part, near, passed,
+                    mesh.piece_element, self._linear, law, bundle.sky is not None, part, near, seen, passed,
                 )  # fmt: skip
                 if not through:
                     break
@@ -379,8 +398,9 @@ class Gatherer:
                 beyond = origins[row] + (passed[:through, 2:] * scale + tracer.offset * scale) * along
                 origins, directions = np.ascontiguousarray(beyond, np.float32), np.ascontiguousarray(directions[row])
                 owner, run, weight = owner[row], run[row], np.ascontiguousarray(passed[:through, 1])
-            sums[block] += part
-            reach[block] += near
+            bundle.sums[block] += part
+            bundle.seen[block] += seen
+            bundle.reach[block] += near
             return traced, hits
 
         if self.workers > 1 and len(blocks) > 1:
@@ -402,22 +422,32 @@ class _Bundle:
     points: FloatArray
     normals: FloatArray
     sums: FloatArray
+    seen: FloatArray
     reach: FloatArray
     count: IntArray
+    sky: SkyLight | None
+    crowded: NDArray[np.bool_]
 
-    def result(self) -> tuple[FloatArray, FloatArray]:
-        """Mean of each bundle and its standard error, from the spread of the runs.
+    def result(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean of each bundle, the standard error from the spread of the runs, and the sky seen where it is asked.
 
         Four runs tell an error but roughly, so each point's counts together with the mean of all.
         """
         count = self.count[:, None]
         mean = self.sums.sum(axis=1) / count
         each = self.sums * (RUNS / count[..., None])
-        square = ((each - mean[:, None]) ** 2).sum(axis=1) / (RUNS * (RUNS - 1.0))
+        from_sky = np.zeros_like(mean)
+        if self.sky is not None:
+            seen = self.seen * (RUNS * self.crowded[:, None, None] / count[..., None])
+            parts = np.stack([self.sky.irradiance(seen[:, run]) for run in range(RUNS)], axis=1)
+            from_sky = parts.mean(axis=1)
+            each = each + parts
+        square = ((each - each.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) / (RUNS * (RUNS - 1.0))
         # Points with other numbers of rays differ: what they share is the spread at one ray's count.
         common = count**1.5
         pooled = (square * common).mean(axis=0) / common
-        return mean, NET_GAIN * np.sqrt((POOL * pooled + (RUNS - 1.0) * square) / (POOL + RUNS - 1.0))
+        spread = NET_GAIN * np.sqrt((POOL * pooled + (RUNS - 1.0) * square) / (POOL + RUNS - 1.0))
+        return mean, spread, from_sky
 
     def distance(self) -> FloatArray:
         """Harmonic mean distance of the hits, infinite where nothing was met."""

@@ -1,6 +1,7 @@
-"""Light that arrives from outside the mesh: lights without surface, and the background.
+"""Light that arrives from outside the mesh: lights without surface, and the sky or background.
 
-Both reach the elements before the first shot, through Embree.
+Both reach the elements before the first shot: lights through Embree, the sky cut exactly by what
+hides it where that can be.
 """
 
 from __future__ import annotations
@@ -14,14 +15,19 @@ from numpy.typing import NDArray
 from radiosity.form_factors._sampling import place_on_pieces, stream
 from radiosity.patches import PatchMesh
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
+from workbench.geometry.flat import Geometry
 from workbench.scene.model import Light, Scene
+from workbench.shadow.occlusion import Shader
+from workbench.shadow.sky import SkyLight
 
 __all__ = ["incident_irradiance"]
 
 FloatArray = NDArray[np.float64]
 
 POINTS = 4
-"""Points an element at which lights without surface are evaluated."""
+"""Points an element at which lights without surface and the sky are evaluated."""
+FEW_ELEMENTS, MORE_POINTS = 256, 16
+"""Points an element for the sky in meshes of few elements, which are large."""
 
 # Generalised golden ratio in two dimensions.
 _G2 = 1.3247179572447460
@@ -83,16 +89,29 @@ def _from_light(light: Light, points: FloatArray, normals: FloatArray, tracer: E
     return value
 
 
-def _from_background(
-    mesh: PatchMesh, first: int, last: int, count: int, seed: int, tracer: EmbreeAccelerator
+def _from_sky(
+    mesh: PatchMesh, first: int, last: int, count: int, rays: int, seed: int, sky: SkyLight, shader: Shader
 ) -> FloatArray:
-    """Share of cosine-weighted directions that miss everything, (elements,)."""
+    """Mean irradiance (elements, bands) of elements from the sky: exact at ``count`` points, or by rays."""
     points, normals = _points(mesh, first, last, count, seed)
-    rng = np.random.default_rng([seed, first])
-    shift = np.repeat(rng.random((last - first, 2)), count, axis=0)
-    k = np.tile(np.arange(count), last - first)
+    own = np.repeat(mesh.element_polygon[first:last], count)
+    shares = sky.shares(shader, points, normals, own_polygon=own, error=1e-3)
+    crowded = np.flatnonzero(np.isnan(shares[:, 0]))
+    if len(crowded):
+        shares[crowded] = _sky_by_rays(points[crowded], normals[crowded], rays, [seed, first], sky, shader)
+    return sky.irradiance(shares.reshape(-1, count, 2).mean(axis=1))
+
+
+def _sky_by_rays(
+    points: FloatArray, normals: FloatArray, count: int, seed: list[int], sky: SkyLight, shader: Shader
+) -> FloatArray:
+    """What :meth:`SkyLight.shares` gives, from ``count`` cosine-distributed rays a point."""
+    rng = np.random.default_rng(seed)
+    shift = np.repeat(rng.random((len(points), 2)), count, axis=0)
+    k = np.tile(np.arange(count), len(points))
     u = ((k + 0.5) / count + shift[:, 0]) % 1.0
     phi = 2.0 * math.pi * ((k / 1.6180339887498949 + shift[:, 1]) % 1.0)
+    points, normals = np.repeat(points, count, axis=0), np.repeat(normals, count, axis=0)
     # Malley's method: cosine-weighted directions are a disk lifted to the hemisphere.
     radius, height = np.sqrt(u), np.sqrt(1.0 - u)
     helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
@@ -100,22 +119,27 @@ def _from_background(
     a /= np.linalg.norm(a, axis=1)[:, None]
     b = np.cross(normals, a)
     along = a * (radius * np.cos(phi))[:, None] + b * (radius * np.sin(phi))[:, None] + normals * height[:, None]
-    blocked = tracer.occluded(points + tracer.offset * normals, along, np.inf)
-    return 1.0 - blocked.reshape(-1, count).mean(axis=1)
+    free = ~shader.tracer.occluded(points + shader.tracer.offset * normals, along, np.inf)
+    above, radiance = sky.relative(along)
+    return np.stack(
+        [math.pi * (free * radiance).reshape(-1, count).mean(axis=1), (free & ~above).reshape(-1, count).mean(axis=1)],
+        axis=1,
+    )
 
 
 def incident_irradiance(
-    scene: Scene, mesh: PatchMesh, tracer: EmbreeAccelerator, *, background_rays: int = 128, seed: int = 0
+    scene: Scene, mesh: PatchMesh, tracer: EmbreeAccelerator, *, sky_rays: int = 128, seed: int = 0
 ) -> FloatArray:
-    """Irradiance of every element from the lights without surface and from the background.
+    """Irradiance of every element from the lights without surface and from the sky or background.
 
     Parameters
     ----------
     scene, mesh : Scene, PatchMesh
     tracer : EmbreeAccelerator
         Over the scene's geometry.
-    background_rays : int
-        Cosine-distributed rays an element toward the background.
+    sky_rays : int
+        Cosine-distributed rays a point of an element toward the sky, where its occluders are too many
+        to be cut.
     seed : int
 
     Returns
@@ -124,9 +148,10 @@ def incident_irradiance(
         Irradiance. [W m-2]
     """
     out = np.zeros((mesh.element_count, mesh.bands))
-    if not scene.lights and (scene.closed or not scene.background.any()):
+    sky = SkyLight.of_scene(scene)
+    if not scene.lights and sky is None:
         return out
-    step = max(1, BLOCK_RAYS // max(POINTS, background_rays))
+    step = max(1, BLOCK_RAYS // POINTS)
     for first in range(0, mesh.element_count, step):
         last = min(first + step, mesh.element_count)
         for light in scene.lights:
@@ -134,7 +159,11 @@ def incident_irradiance(
             samples = POINTS if light.kind == "linear" else 1
             value = sum(_from_light(light, points, normals, tracer, k) for k in range(samples)) / samples
             out[first:last] += np.asarray(value).reshape(-1, POINTS).mean(axis=1)[:, None] * light.power
-        if scene.background.any() and not scene.closed:
-            share = _from_background(mesh, first, last, background_rays, seed, tracer)
-            out[first:last] += share[:, None] * (math.pi * scene.background)
+    if sky is not None:
+        shader = Shader(Geometry.from_scene(scene))
+        count = POINTS if mesh.element_count > FEW_ELEMENTS else MORE_POINTS
+        step = max(1, BLOCK_RAYS // (4 * count))
+        for first in range(0, mesh.element_count, step):
+            last = min(first + step, mesh.element_count)
+            out[first:last] += _from_sky(mesh, first, last, count, sky_rays, seed, sky, shader)
     return out

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Camera", "Light", "Material", "Scene", "Sphere", "Surface"]
+__all__ = ["SKY_KINDS", "Camera", "Light", "Material", "Scene", "Sky", "Sphere", "Surface"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -207,6 +207,39 @@ class Light:
     lambertian: bool = False
 
 
+SKY_KINDS = ("uniform", "overcast", *(f"cie-{number}" for number in range(1, 16)))
+"""The skies: the same radiance all over, the CIE traditional overcast sky (1 + 2 sin) / 3, and the fifteen
+standard general skies of CIE S 011 / ISO 15469."""
+
+
+@dataclass(frozen=True)
+class Sky:
+    """The light of the sky above the horizon and of the ground below it, both infinitely far.
+
+    Parameters
+    ----------
+    kind : str
+        One of :data:`SKY_KINDS`.
+    zenith_radiance : (bands,) float, optional
+        [W m-2 sr-1]  Either this or the next.
+    horizontal_irradiance : (bands,) float, optional
+        On an unobstructed surface that faces up, without the sun's own beam. [W m-2]
+    ground_reflectance : (bands,) float
+        The ground shines as a diffuse plane of this reflectance under the whole sky. [0..1]
+    up : (3,) float
+        Unit vector to the zenith.
+    sun_direction : (3,) float, optional
+        Unit vector to the sun, which the brighter part of most general skies follows.
+    """
+
+    kind: str
+    ground_reflectance: FloatArray
+    zenith_radiance: FloatArray | None = None
+    horizontal_irradiance: FloatArray | None = None
+    up: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    sun_direction: FloatArray | None = None
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera: ``fov_deg`` is the full vertical angle, pixels are square."""
@@ -224,7 +257,8 @@ class Scene:
     """Everything that a reader found, in the order of the file.
 
     ``closed`` says that the author declares the surfaces an enclosure: no light escapes, every
-    row of form factors sums to 1.  ``background`` is the radiance seen where no surface is.
+    row of form factors sums to 1.  ``background`` is the radiance seen where no surface is, unless
+    there is a ``sky``.
     ``notes`` tell, a sentence each, what the reader changed or supposed.
     """
 
@@ -237,6 +271,7 @@ class Scene:
     closed: bool = False
     path: Path | None = None
     notes: tuple[str, ...] = ()
+    sky: Sky | None = None
 
     @property
     def has_emitter(self) -> bool:
@@ -245,4 +280,5 @@ class Scene:
             any(surface.material.emission.any() for surface in self.surfaces)
             or any(light.power.any() for light in self.lights)
             or bool(self.background.any())
+            or self.sky is not None
         )

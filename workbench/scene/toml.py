@@ -7,10 +7,14 @@ Keys at the top::
     bands                           # number of bands; else that of the longest list, 3 where a mesh
                                     # brings its own materials, or 1
     closed = true                   # the author's word that no light can leave
-    background                      # radiance of the sky [W/(m2 sr)]
+    background                      # radiance where no surface is [W/(m2 sr)]
 
     [camera]                        # eye, look_at; up = [0, 0, 1], fov = 45 (vertical, degrees),
                                     # width = 512, height = 512
+    [sky]                           # type = "uniform", "overcast" (the CIE traditional overcast sky) or
+                                    # "cie-1" to "cie-15" (CIE S 011); zenith_radiance [W/(m2 sr)] or
+                                    # horizontal_irradiance [W/m2] (of the sky, without the sun's beam);
+                                    # ground_reflectance = 0, up = [0, 0, 1], sun_direction (to the sun)
     [materials.NAME]                # reflectance, emission [W/m2, radiant exitance], specular,
                                     # exponent = inf, transmittance, ior = 1, two_sided = false
     [[surface]]                     # name, material, one shape, transform
@@ -77,7 +81,7 @@ from workbench.errors import InputError, SceneError
 from workbench.geometry.polygons import vector_area
 from workbench.scene._tokens import LARGEST, LARGEST_SIDE, read_text
 from workbench.scene.library import box_surface, polygon_fault, sphere_surface, torus_knot_mesh, transformed
-from workbench.scene.model import Camera, Light, Material, Scene, Surface
+from workbench.scene.model import SKY_KINDS, Camera, Light, Material, Scene, Sky, Surface
 
 __all__ = ["load_scene", "read_toml"]
 
@@ -239,6 +243,23 @@ class _CameraTable(_Table):
     height: Annotated[StrictInt, Field(ge=1, le=LARGEST_SIDE)] = 512
 
 
+def _sky_kind(value: Any) -> str:
+    if isinstance(value, str) and value in SKY_KINDS:
+        return value
+    close = difflib.get_close_matches(str(value), SKY_KINDS, n=1, cutoff=0.5)
+    wanted = f"did you mean {close[0]!r}?" if close else "expected uniform, overcast, or cie-1 to cie-15"
+    raise ValueError(f"found {_show(value)}; {wanted}")
+
+
+class _SkyTable(_Table):
+    type: Annotated[Any, BeforeValidator(_sky_kind)]
+    zenith_radiance: Bands = None
+    horizontal_irradiance: Bands = None
+    ground_reflectance: Share = np.zeros(1)
+    up: Direction = np.array([0.0, 0.0, 1.0])
+    sun_direction: Direction = None
+
+
 class _MaterialTable(_Table):
     reflectance: Share = np.zeros(1)
     emission: Bands = np.zeros(1)
@@ -364,6 +385,7 @@ class _File(_Table):
     closed: StrictBool = False
     background: Bands = np.zeros(1)
     camera: _CameraTable | None = None
+    sky: _SkyTable | None = None
     materials: dict[str, _MaterialTable] = {}
     surface: list[_SurfaceTable] = []
     light: list[dict[str, Any]] = []
@@ -463,6 +485,10 @@ class _Builder:
 
     def _band_values(self) -> Iterator[tuple[Key, FloatArray]]:
         yield ("background",), self.table.background
+        if self.table.sky is not None:
+            for field in ("zenith_radiance", "horizontal_irradiance", "ground_reflectance"):
+                if getattr(self.table.sky, field) is not None:
+                    yield ("sky", field), getattr(self.table.sky, field)
         for name, material in self.table.materials.items():
             for field in ("reflectance", "emission", "specular", "transmittance"):
                 yield ("materials", name, field), getattr(material, field)
@@ -680,6 +706,29 @@ class _Builder:
         material = Material(table.name, zero, self.spread(exitance), zero, math.inf, zero)
         return self.polygon(table.name, material, [[table.polygon]], [(*key, "polygon")])
 
+    def sky(self) -> Sky | None:
+        table = self.table.sky
+        if table is None:
+            return None
+        if (table.zenith_radiance is None) == (table.horizontal_irradiance is None):
+            self.fail(("sky",), "expected exactly one of zenith_radiance and horizontal_irradiance")
+        if self.table.background.any():
+            self.fail(("background",), "found a background beside [sky], expected one of them")
+        if self.table.closed:
+            self.fail(("closed",), "found true in a scene with a [sky], which no light of it could enter; remove one")
+        if table.sun_direction is None and table.type not in ("uniform", "overcast", "cie-1", "cie-3", "cie-5"):
+            self.fail(("sky", "sun_direction"), f"found nothing, expected the direction to the sun of sky {table.type}")
+        if table.sun_direction is not None and not table.sun_direction @ table.up > 0:
+            self.fail(
+                ("sky", "sun_direction"), "found a sun below the horizon, expected one above it (it points to it)"
+            )
+        given = {
+            name: None if getattr(table, name) is None else self.spread(getattr(table, name))
+            for name in ("zenith_radiance", "horizontal_irradiance")
+        }
+        ground = self.spread(table.ground_reflectance)
+        return Sky(table.type, ground, up=table.up, sun_direction=table.sun_direction, **given)
+
     def camera(self) -> Camera | None:
         table = self.table.camera
         if table is None:
@@ -768,7 +817,7 @@ def load_scene(path: str | Path) -> Scene:
         builder = _Builder(path, file, lights)
         point_lights, emitters = builder.light_records()
         surfaces = tuple(itertools.chain(builder.surfaces(), emitters))
-        camera = builder.camera()
+        camera, sky = builder.camera(), builder.sky()
     if not surfaces:
         raise SceneError("found no surface, expected at least one [[surface]]; add it", path=path, key="surface")
     return Scene(
@@ -781,4 +830,5 @@ def load_scene(path: str | Path) -> Scene:
         closed=file.closed,
         path=path,
         notes=tuple(builder.notes),
+        sky=sky,
     )
