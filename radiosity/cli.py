@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from radiosity.chart_command import chart
 from radiosity.reproduce import REPRODUCTIONS
 from radiosity.shadow_command import shadow
 from workbench.errors import InputError, OptionError, WorkbenchError
@@ -391,6 +392,7 @@ def reproduce(name: str, directory: Path | None, quick: bool) -> None:
 
 
 main.add_command(shadow)
+main.add_command(chart)
 
 
 # ---- render -----------------------------------------------------------------------------------

@@ -133,7 +133,7 @@ class Mitsuba(Rival):
         count = len(points) * samples
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(seed % (1 << 32), count)
-        row = dr.arange(mi.UInt32, count) // samples
+        row = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, samples)  # one kernel for all numbers of samples
 
         def at(values: FloatArray) -> Any:
             columns = [mi.Float(np.ascontiguousarray(values[:, axis], dtype=np.float32)) for axis in range(3)]

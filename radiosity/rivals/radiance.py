@@ -147,19 +147,25 @@ class Radiance(Rival):
         return found
 
     def picture(self, camera: Camera, *, samples: int, seed: int = 0, direct_only: bool = False) -> FloatArray:
-        """A picture (height, width, bands), one ray through each pixel's centre. [W m-2 sr-1]"""
+        """A picture (height, width, bands), ``samples`` rays at random places of each pixel. [W m-2 sr-1]
+
+        Each ray follows one path: many parts of a source or ambient divisions would be wasted on it.
+        """
         if samples < 1:
             raise OptionError(f"samples: found {samples}, expected 1 or more")
         pinhole = PinholeRays.from_camera(camera)
-        toward = pinhole.row_directions(0, camera.height)
+        pixel = np.repeat(np.arange(camera.height * camera.width), samples)
+        place = np.random.default_rng(seed).random((2, len(pixel)))
+        toward = pinhole.directions(pixel % camera.width + place[0], pixel // camera.width + place[1])
         rays = np.column_stack([np.broadcast_to(pinhole.eye, toward.shape), toward])
-        ambient, repeats = self._ambient(samples, direct_only)
-        order = np.repeat(np.arange(len(rays)), repeats)
-        found = np.zeros((len(rays), self.scene.bands))
+        ambient = ["-ab", "0", "-ds", "0"]
+        if not direct_only:
+            bounces = self.ambient_bounces
+            ambient = ["-ab", str(bounces), "-ad", "1", "-as", "0", "-ds", "0", "-lr", str(-bounces - 2), "-lw", "0.1"]
+        found = np.zeros((camera.height * camera.width, self.scene.bands))
         for chosen, octree in zip(self._triples, self._octrees, strict=True):
-            values = self._trace(octree, rays[order], False, ambient, seed)
-            sums = np.stack([np.bincount(order, values[:, k], len(rays)) for k in range(len(chosen))], axis=1)
-            found[:, chosen] = sums / repeats
+            values = self._trace(octree, rays, False, ambient, seed).reshape(-1, samples, 3).mean(axis=1)
+            found[:, chosen] = values[:, : len(chosen)]
         return found.reshape(camera.height, camera.width, self.scene.bands)
 
 

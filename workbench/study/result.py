@@ -19,7 +19,7 @@ from workbench.record import RunRecord, write_text_atomically
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["StudyResult", "format_table", "interleaved", "write_study"]
+__all__ = ["StudyResult", "format_cell", "format_table", "interleaved", "write_study"]
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,8 @@ def interleaved(
     return seconds, answers
 
 
-def _cell(value: Any) -> str:
+def format_cell(value: Any) -> str:
+    """A value as a table shows it: numbers to three digits, nothing for ``None``."""
     if value is None:
         return ""
     if isinstance(value, (bool, str)):
@@ -96,7 +97,7 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
     if not rows:
         return ""
     names = list(rows[0])
-    cells = [[_cell(row[name]) for name in names] for row in rows]
+    cells = [[format_cell(row[name]) for name in names] for row in rows]
     heads = [name.replace("_", " ") for name in names]
     widths = [max(len(head), *(len(line[i]) for line in cells)) for i, head in enumerate(heads)]
     text = [all(isinstance(row[name], (str, type(None))) for row in rows) for name in names]

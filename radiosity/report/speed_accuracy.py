@@ -1,0 +1,468 @@
+"""Error against seconds: run techniques over their settings, keep a record that grows, chart it.
+
+A record is a CSV file with one row a run.  Runs already in it are not run again, so a chart resumes
+after an interruption and takes up new techniques and settings at their own cost.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+import resource
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from radiosity.report.metrics import at_error, frontier, relative_rms, slope
+from radiosity.report.techniques import Problem, Reference, Technique
+from workbench.errors import InputError
+from workbench.record import write_text_atomically
+from workbench.scene.model import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "COUNTS", "Point", "Run", "auto_ratios", "draw_chart", "measure", "points_of", "read_runs", "scene_digest",
+    "write_runs",
+]  # fmt: skip
+
+COUNTS = (
+    "rays", "tests", "voxels_stepped", "plane_vertex_checks", "shaft_tests", "closed_forms", "exact_cuts",
+    "camera_polygons", "links", "shots",
+)  # fmt: skip
+"""Counts of work that a record keeps; ``tests`` are all tests of rays against polygons, boxes and spheres."""
+_TESTS = ("polygon_tests", "box_tests", "bounding_sphere_tests", "sphere_tests")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: a row of the record.
+
+    Parameters
+    ----------
+    method, kind, key : str
+        Technique, its kind (ours, auto, rival) and what its setting is called.
+    value : float
+        The setting.
+    seed, repeat : int
+    seconds, cpu_seconds : float
+        Wall-clock and processor time, all threads and child processes.
+    prepare_seconds : float
+        To load the scene into the technique, once; not part of ``seconds``.
+    memory_MB : float
+        Most memory that the run took beyond what was in use before; 0 where the system does not tell.
+    error, error_standard_error : float
+        See :func:`radiosity.report.metrics.relative_rms`.
+    stated_error : float
+        What the technique itself says; nan if it says nothing.
+    rays ... shots : int
+        See :data:`COUNTS`.
+    """
+
+    method: str
+    kind: str
+    key: str
+    value: float
+    seed: int
+    repeat: int
+    seconds: float
+    cpu_seconds: float
+    prepare_seconds: float
+    memory_MB: float
+    error: float
+    error_standard_error: float
+    stated_error: float
+    rays: int = 0
+    tests: int = 0
+    voxels_stepped: int = 0
+    plane_vertex_checks: int = 0
+    shaft_tests: int = 0
+    closed_forms: int = 0
+    exact_cuts: int = 0
+    camera_polygons: int = 0
+    links: int = 0
+    shots: int = 0
+
+    @property
+    def place(self) -> tuple[str, float, int, int]:
+        """What tells runs of one record apart."""
+        return self.method, self.value, self.seed, self.repeat
+
+
+@dataclass(frozen=True)
+class Point:
+    """All runs of one technique at one setting, summed up.
+
+    ``seconds`` is the median, ``quick`` and ``slow`` the fastest and the slowest run; ``error`` the
+    root mean square over the seeds, ``doubt`` its standard error.
+    """
+
+    method: str
+    kind: str
+    key: str
+    value: float
+    seconds: float
+    quick: float
+    slow: float
+    cpu_seconds: float
+    memory_MB: float
+    error: float
+    doubt: float
+    stated: float
+    runs: int
+    counts: dict[str, int]
+
+
+# ---- the record -----------------------------------------------------------------------------------
+
+
+def write_runs(path: Path, runs: Sequence[Run]) -> None:
+    """Write the record, whole or not at all, in the order of techniques, settings, seeds and repeats."""
+    table = io.StringIO()
+    names = [f.name for f in fields(Run)]
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(names)
+    for run in runs:
+        cells = (getattr(run, name) for name in names)
+        writer.writerow([f"{cell:.9g}" if isinstance(cell, float) else cell for cell in cells])
+    write_text_atomically(path, table.getvalue())
+
+
+def read_runs(path: Path) -> list[Run]:
+    """Read a record.
+
+    Raises
+    ------
+    InputError
+        If the file is no such record.
+    """
+    kinds = {f.name: {"str": str, "float": float, "int": int}[str(f.type)] for f in fields(Run)}
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        return [Run(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in rows]
+    except (OSError, KeyError, TypeError, ValueError, UnicodeDecodeError) as problem:
+        raise InputError(f"{path}: found no record of runs ({problem}); give another folder, or remove it") from None
+
+
+def scene_digest(scene: Scene) -> str:
+    """A name for what a scene holds: surfaces, materials, lights, camera and background."""
+    made = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        if isinstance(value, np.ndarray):
+            made.update(f"{value.dtype}{value.shape}".encode())
+            made.update(np.ascontiguousarray(value).tobytes())
+        elif isinstance(value, (tuple, list)):
+            for item in value:
+                add(item)
+        elif hasattr(value, "__dataclass_fields__"):
+            for f in fields(value):
+                if f.name not in ("path", "notes"):
+                    add(getattr(value, f.name))
+        else:
+            made.update(repr(value).encode())
+
+    add(scene)
+    return made.hexdigest()[:16]
+
+
+# ---- running ----------------------------------------------------------------------------------------
+
+
+class _Memory:
+    """Most resident memory since the beginning of the block, beyond what was resident then. [MB]"""
+
+    used = 0.0
+
+    def __enter__(self) -> _Memory:
+        self._before = self._read("VmRSS")
+        try:
+            Path("/proc/self/clear_refs").write_text("5")  # the high-water mark begins anew
+            self._fresh = True
+        except OSError:
+            self._fresh = False
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._fresh:
+            self.used = max(0.0, self._read("VmHWM") - self._before)
+
+    @staticmethod
+    def _read(name: str) -> float:
+        try:
+            for line in Path("/proc/self/status").read_text().splitlines():
+                if line.startswith(name):
+                    return int(line.split()[1]) / 1024.0
+        except OSError:
+            pass
+        return 0.0
+
+
+def _processor_seconds() -> float:
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
+def _counted(counters: Any) -> dict[str, int]:
+    counts = {name: int(counters.get(name, 0)) for name in COUNTS if name != "tests"}
+    counts["tests"] = sum(int(counters.get(name, 0)) for name in _TESTS)
+    return counts
+
+
+def measure(
+    problem: Problem,
+    reference: Reference,
+    plan: Sequence[tuple[str, Sequence[float] | None]],
+    *,
+    seeds: Sequence[int] = (0,),
+    repeats: int = 3,
+    limit: float = math.inf,
+    before: Iterable[Run] = (),
+    save: Callable[[list[Run]], None] = lambda runs: None,
+    report: Callable[[str], None] = lambda line: None,
+) -> tuple[list[Run], list[str]]:
+    """Run techniques over their settings, interleaved.
+
+    Every technique runs its coarsest setting once in vain first: kernels are compiled and loaded
+    then.  In each round all settings of all techniques run one after the other, every other round
+    backwards, so that a machine that slows down slows all alike.
+
+    Parameters
+    ----------
+    problem : Problem
+    reference : Reference
+    plan : sequence of (str, sequence of float or None)
+        Techniques and their settings; ``None`` takes the technique's own.
+    seeds : sequence of int
+        A technique without chance runs with the first only.
+    repeats : int
+        Rounds with each seed.
+    limit : float
+        After a setting whose first run took longer, finer settings of the technique are left out. [s]
+    before : iterable of Run
+        Runs of an old record.
+    save : callable
+        Called with all runs after each one.
+    report : callable
+        Called with a line about each run, and about what is left out.
+
+    Returns
+    -------
+    runs : list of Run
+        Old and new ones, in the order of the plan.
+    notes : list of str
+        What was left out and why.
+    """
+    from workbench.errors import WorkbenchError
+
+    known = {run.place: run for run in before}
+    notes: list[str] = []
+    judge = problem.judged(reference.values)
+    variance = reference.variance
+    if isinstance(variance, np.ndarray):
+        variance = problem.judged(variance)
+    made: dict[str, tuple[Technique, float]] = {}
+    tasks: list[tuple[str, float]] = []
+    for name, chosen in plan:
+        start = time.perf_counter()
+        try:
+            technique = problem.technique(name)
+            prepare = time.perf_counter() - start
+            values = tuple(chosen) if chosen is not None else technique.values
+            wanted = [(name, value, seed, r) for value in values for seed in seeds for r in range(repeats)]
+            if not technique.seeded:
+                wanted = [place for place in wanted if place[2] == seeds[0]]
+            if any(place not in known for place in wanted):
+                technique.ask(values[0], seeds[0])
+        except WorkbenchError as problem_found:
+            notes.append(f"{name} is left out: {problem_found}")
+            report(notes[-1])
+            continue
+        made[name] = technique, prepare
+        tasks += [(name, value) for value in values]
+    finest: dict[str, int] = {}
+    order = {name: [value for n, value in tasks if n == name] for name in made}
+    rounds = [(seed, repeat) for repeat in range(repeats) for seed in seeds]
+    for number, (seed, repeat) in enumerate(rounds):
+        for name, value in tasks[:: 1 if number % 2 == 0 else -1]:
+            technique, prepare = made[name]
+            if (not technique.seeded and seed != seeds[0]) or order[name].index(value) > finest.get(name, 1 << 30):
+                continue
+            place = (name, value, seed, repeat)
+            if place not in known:
+                try:
+                    with _Memory() as memory:
+                        used, start = _processor_seconds(), time.perf_counter()
+                        answer = technique.ask(value, seed)
+                        seconds, used = time.perf_counter() - start, _processor_seconds() - used
+                    error, doubt = relative_rms(problem.judged(answer.values), judge, variance)
+                except WorkbenchError as problem_found:
+                    notes.append(f"{name} at {technique.key} {value:g} is left out: {problem_found}")
+                    report(notes[-1])
+                    finest[name] = order[name].index(value) - 1
+                    continue
+                stated = math.nan if answer.stated is None else answer.stated
+                known[place] = Run(
+                    name, technique.kind, technique.key, float(value), seed, repeat, seconds, used, prepare,
+                    memory.used, error, doubt, stated, **_counted(answer.counters),
+                )  # fmt: skip
+                report(f"{name:20s} {technique.key} {value:<8g} seed {seed}: {seconds:8.3f} s, error {error:.2e}")
+                save(list(known.values()))
+            if known[place].seconds > limit and name not in finest and order[name][-1] != value:
+                finest[name] = order[name].index(value)
+                left = order[name][finest[name] + 1 :]
+                notes.append(
+                    f"{name}: {technique.key} {', '.join(f'{v:g}' for v in left)} left out, since {value:g} took longer"
+                    f" than {limit:g} s (--limit)"
+                )
+                report(notes[-1])
+    runs = list(known.values())
+    runs.sort(key=lambda run: (list(dict.fromkeys(r.method for r in known.values())).index(run.method), *run.place[1:]))
+    return runs, notes
+
+
+# ---- summing up -------------------------------------------------------------------------------------
+
+
+def points_of(runs: Sequence[Run]) -> list[Point]:
+    """One point a technique and setting, in the order of the runs."""
+    groups: dict[tuple[str, float], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((run.method, run.value), []).append(run)
+    points = []
+    for (method, value), mine in groups.items():
+        seconds = [run.seconds for run in mine]
+        by_seed = {run.seed: run for run in mine}
+        squares = [run.error**2 for run in by_seed.values()]
+        error = math.sqrt(statistics.fmean(squares))
+        inner = math.sqrt(sum(run.error_standard_error**2 for run in by_seed.values())) / len(by_seed)
+        between = 0.0
+        if len(squares) > 1 and error > 0:
+            between = statistics.stdev(squares) / math.sqrt(len(squares)) / (2.0 * error)
+        first = mine[0]
+        counts = {name: round(statistics.fmean(getattr(run, name) for run in by_seed.values())) for name in COUNTS}
+        points.append(
+            Point(
+                method,
+                first.kind,
+                first.key,
+                value,
+                statistics.median(seconds),
+                min(seconds),
+                max(seconds),
+                statistics.median(run.cpu_seconds for run in mine),
+                max(run.memory_MB for run in mine),
+                error,
+                max(inner, between),
+                statistics.fmean(run.stated_error for run in by_seed.values()),
+                len(mine),
+                counts,
+            )
+        )
+    return points
+
+
+def auto_ratios(points: Sequence[Point]) -> list[tuple[Point, float | None]]:
+    """For each automatic point: its seconds over those of our best hand-tuned ones at the same error.
+
+    ``None`` where no hand-tuned point is as exact: automatic choice is on its own there.
+    """
+    tuned = [p for p in points if p.kind == "ours"]
+    found = []
+    for point in points:
+        if point.kind == "auto":
+            best = at_error([p.seconds for p in tuned], [p.error for p in tuned], point.error)
+            found.append((point, point.seconds / best if best else None))
+    return found
+
+
+# ---- the figure -------------------------------------------------------------------------------------
+
+_COLOURS = (
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#4d4d4d", "#80ba5a", "#a5694f",
+    "#11a579", "#e73f74",
+)  # fmt: skip
+_MARKERS = "osD^vPX<>hp8"
+
+
+def draw_chart(figure: Figure, points: Sequence[Point], *, title: str, label: str, floor: float = 0.0) -> None:
+    """Error against seconds on logarithmic axes, into an empty figure.
+
+    Ours are drawn in full lines, rivals in dashed ones with open markers, automatic choices as
+    stars; the frontier of all is a broad grey line.  Bars reach from the fastest to the slowest run
+    and over one standard error.  Below ``floor``, the reference's own error, nothing can be told.
+    """
+    figure.set_size_inches(9.5, 6.2)
+    axes = figure.subplots()
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    shown = [p for p in points if p.seconds > 0]
+    positive = [p.error for p in shown if p.error > 0]
+    least = min(positive) if positive else 1e-6
+    zero = max(least / 3.0, 1e-16)  # where points without any error are drawn
+
+    def height(p: Point) -> float:
+        return p.error if p.error > 0 else zero
+
+    best = frontier([p.seconds for p in shown], [height(p) for p in shown])
+    axes.plot(
+        [shown[i].seconds for i in best], [height(shown[i]) for i in best], color="0.8", lw=9, zorder=1,
+        solid_capstyle="round", solid_joinstyle="round", label="frontier: nothing is both faster and more exact",
+    )  # fmt: skip
+    for number, method in enumerate(dict.fromkeys(p.method for p in shown)):
+        mine = [p for p in shown if p.method == method]
+        steep = slope([p.seconds for p in mine], [p.error for p in mine])
+        kind = mine[0].kind
+        name = method + {"ours": "", "auto": " (chooses itself)", "rival": " (rival)"}[kind]
+        text = name if steep is None else f"{name}, slope {steep:.2f}"
+        colour = _COLOURS[number % len(_COLOURS)]
+        marker = "*" if kind == "auto" else _MARKERS[number % len(_MARKERS)]
+        x, y = [p.seconds for p in mine], [height(p) for p in mine]
+        axes.errorbar(
+            x, y,
+            xerr=[[p.seconds - p.quick for p in mine], [p.slow - p.seconds for p in mine]],
+            yerr=[[min(p.doubt, 0.9 * h) if p.error > 0 else 0.0 for p, h in zip(mine, y, strict=True)],
+                  [p.doubt if p.error > 0 else 0.0 for p in mine]],
+            color=colour, marker=marker, ms=14 if kind == "auto" else 7, mfc="none" if kind == "rival" else colour,
+            mec="black" if kind == "auto" else colour, mew=0.8 if kind == "auto" else 1.4,
+            ls="--" if kind == "rival" else "-", lw=1.4, elinewidth=0.8, capsize=2, label=text,
+            zorder=4 if kind == "auto" else 3,
+        )  # fmt: skip
+        if kind == "auto":
+            for p in mine:
+                if p.error == 0 and p is not mine[0]:
+                    continue  # they lie on top of each other
+                axes.annotate(
+                    f"{p.value:g}", (p.seconds, height(p)), xytext=(7, 7), textcoords="offset points", fontsize=8,
+                    color=colour,
+                )  # fmt: skip
+    if floor > 0:
+        axes.axhspan(axes.get_ylim()[0], floor, color="0.93", zorder=0)
+        axes.axhline(floor, color="0.5", lw=0.8, ls=":", label="error of the reference itself")
+    for share in (0.1, 0.01, 0.001):
+        low, high = axes.get_ylim()
+        if low < share < high:
+            axes.axhline(share, color="0.75", lw=0.6, zorder=0)
+            axes.annotate(
+                f"{share:.0%}" if share >= 0.01 else f"{share:.1%}", (1.0, share), xycoords=("axes fraction", "data"),
+                xytext=(-3, 2), textcoords="offset points", ha="right", fontsize=8, color="0.4",
+            )  # fmt: skip
+    if any(p.error == 0 for p in shown):
+        axes.annotate(
+            "no error at all", (1.0, zero), xycoords=("axes fraction", "data"), xytext=(-3, 4),
+            textcoords="offset points", ha="right", fontsize=8, color="0.4",
+        )  # fmt: skip
+    axes.set_xlabel("seconds, median (bars: fastest and slowest run)")
+    axes.set_ylabel(label)
+    axes.set_title(title, fontsize=11)
+    axes.grid(alpha=0.25, which="major")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)

@@ -1,0 +1,97 @@
+"""The command ``radiosity chart`` on small questions, to the files that it leaves."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from radiosity.cli import main
+from radiosity.report.techniques import PROBLEMS, problem_for
+from workbench.scene.load import load
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, ["chart", *arguments], catch_exceptions=False)
+
+
+def rows_of(folder):
+    with (folder / "records.csv").open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_chart_of_shadows_grows(tmp_path):
+    folder = tmp_path / "chart"
+    first = run("cornell-box", "--grid", "8x8", "--repeats", "1", "--methods", "rays,exact", "--sweep", "samples=4,16",
+                "-o", str(folder))  # fmt: skip
+    assert first.exit_code == 0, first.output
+    before = rows_of(folder)
+    # 'samples' is the setting of both; exact cuts do not look at it.
+    assert [(row["method"], row["value"]) for row in before] == [
+        ("rays", "4"), ("rays", "16"), ("exact", "4"), ("exact", "16"),
+    ]  # fmt: skip
+    assert float(before[2]["error"]) == 0.0 and 0.01 < float(before[1]["error"]) < float(before[0]["error"])
+    assert int(before[0]["rays"]) * 4 == int(before[1]["rays"]) > 0
+    second = run("cornell-box", "--grid", "8x8", "--repeats", "1", "--methods", "rays,auto", "--sweep", "samples=4,16",
+                 "--sweep", "error=0.05", "-o", str(folder))  # fmt: skip
+    assert second.exit_code == 0, second.output
+    after = rows_of(folder)
+    assert after[: len(before)] == before and after[-1]["method"] == "auto"
+    for name in ("chart.svg", "chart.png", "report.html", "record.json"):
+        assert (folder / name).stat().st_size > 1000
+    page = (folder / "report.html").read_text()
+    assert "<svg" in page and "camera" not in page and "src=" not in page
+    assert json.loads((folder / "record.json").read_text())["settings"]["what"] == "shadows"
+    other = run("l-room", "--methods", "exact", "-o", str(folder))
+    assert other.exit_code == 2 and "another scene" in other.output
+
+
+@pytest.mark.parametrize("arguments, said", [
+    (["--methods", "magic"], "magic"),
+    (["--sweep", "samples"], "KEY=V1,V2"),
+    (["--sweep", "samples=-1"], "positive"),
+    (["--sweep", "colour=1", "--methods", "exact"], "colour"),
+    (["--width", "10"], "--width"),
+    (["--reference", "nothing.npy", "--methods", "exact"], "nothing.npy"),
+    (["--reference", "magic", "--methods", "exact"], "magic"),
+    (["--grid", "0x4"], "0x4"),
+])  # fmt: skip
+def test_bad_input_is_one_line(tmp_path, arguments, said):
+    found = run("cornell-box", *arguments, "-o", str(tmp_path / "out"))
+    assert found.exit_code == 2
+    assert said in found.output and "Traceback" not in found.output
+
+
+def test_other_questions(tmp_path):
+    small = {"viewfactors": ("l-room", ["--methods", "bundle,rays,hemicube", "--sweep", "bundle=0.1",
+                                        "--sweep", "rays=4096", "--sweep", "hemicube=4"]),
+             "render": ("cornell-box", ["--methods", "aliased,atomic", "--sweep", "aliased=1,2", "--width", "12",
+                                        "--sweep", "atomic=0.5"])}  # fmt: skip
+    bounds = {"bundle": 0.02, "rays": 0.04, "hemicube": 0.6, "aliased": 1.0, "atomic": 1.0}
+    for what, (scene, arguments) in small.items():
+        found = run(scene, "--what", what, "--repeats", "1", *arguments, "-o", str(tmp_path / what))
+        assert found.exit_code == 0, found.output
+        for row in rows_of(tmp_path / what):
+            assert float(row["error"]) < bounds[row["method"]], row
+
+
+def test_solve_against_a_reference_of_ones_own(tmp_path):
+    problem = problem_for("solve", load("l-room"), points=16)
+    values = problem.technique("progressive+gather").ask(200, 3).values
+    np.save(tmp_path / "mine.npy", values)
+    arguments = ["--methods", "progressive,progressive+gather", "--sweep", "elements=100", "--points", "16"]
+    reference = ["--reference", str(tmp_path / "mine.npy")]
+    found = run("l-room", "--what", "solve", "--repeats", "1", *arguments, *reference, "-o", str(tmp_path / "o"))
+    assert found.exit_code == 0, found.output
+    coarse, gathered = rows_of(tmp_path / "o")
+    assert float(gathered["error"]) < 0.03 and float(coarse["error"]) < 0.3
+
+
+def test_every_technique_is_named_in_its_problem():
+    for kind in PROBLEMS.values():
+        assert len(set(kind.names())) == len(kind.names())
+        for name in kind.own:
+            assert hasattr(kind, "_" + name.replace("+", "_").replace("-", "_"))

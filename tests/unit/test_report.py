@@ -1,0 +1,170 @@
+"""Metrics, records and charts of error against seconds, on made-up techniques with known errors."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+
+from radiosity.report.metrics import at_error, frontier, relative_rms, slope
+from radiosity.report.page import html_page
+from radiosity.report.speed_accuracy import (
+    auto_ratios,
+    draw_chart,
+    measure,
+    points_of,
+    read_runs,
+    scene_digest,
+    write_runs,
+)
+from radiosity.report.techniques import Answer, Problem, Reference, Technique
+from workbench.errors import InputError, OptionError
+from workbench.scene.library import diffuse, unit_cube
+
+
+def test_relative_rms_of_a_known_offset():
+    """Half the rows off by 0.1 of a mean of 2: sqrt(0.005) / 2."""
+    reference = np.full((1000, 1), 2.0)
+    found = reference + np.where(np.arange(1000) % 2 == 0, 0.1, 0.0)[:, None]
+    error, doubt = relative_rms(found, reference)
+    assert error == pytest.approx(math.sqrt(0.005) / 2.0)
+    # squares are 0 or 0.01: their standard deviation is 0.005, and d sqrt(x) = dx / (2 sqrt x)
+    assert doubt == pytest.approx(0.005 / math.sqrt(1000) / (2 * math.sqrt(0.005)) / 2.0, rel=1e-2)
+    assert relative_rms(reference, reference) == (0.0, 0.0)
+
+
+def test_relative_rms_takes_off_the_noise_of_the_reference():
+    rng = np.random.default_rng(1)
+    truth = np.ones((40000, 1))
+    reference = truth + 0.03 * rng.normal(size=truth.shape)
+    found = truth + 0.04 * rng.normal(size=truth.shape)
+    error, doubt = relative_rms(found, reference, 0.03**2)
+    assert abs(error - 0.04) < 5 * doubt and doubt < 0.001
+
+
+def test_relative_rms_refuses_what_has_no_meaning():
+    for found, reference in (([1.0], [0.0]), ([math.nan], [1.0]), ([1.0, 2.0], [1.0])):
+        with pytest.raises(InputError):
+            relative_rms(found, reference)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.floats(0.01, 100), st.floats(1e-6, 1)), min_size=1, max_size=20))
+def test_frontier_is_what_nothing_beats(points):
+    seconds, errors = zip(*points, strict=True)
+    kept = frontier(seconds, errors)
+    for i in range(len(points)):
+        beaten = any(seconds[j] <= seconds[i] and errors[j] <= errors[i] and points[j] != points[i] for j in kept)
+        assert beaten or points[i] in [points[k] for k in kept]
+    for a, b in itertools.pairwise(kept):
+        assert seconds[a] < seconds[b] and errors[a] > errors[b]
+
+
+def test_slope_and_seconds_at_an_error():
+    seconds = [0.01, 0.1, 1.0, 10.0]
+    errors = [0.3 * t**-0.5 for t in seconds]
+    assert slope(seconds, errors) == pytest.approx(-0.5)
+    assert slope(seconds[:2], errors[:2]) is None
+    assert at_error(seconds, errors, 0.3) == pytest.approx(1.0)
+    assert at_error(seconds, errors, 0.6) == pytest.approx(0.25)
+    assert at_error(seconds, errors, 99.0) == 0.01
+    assert at_error(seconds, errors, 0.01) is None
+
+
+class Coin(Problem):
+    """Estimate 1 with a known error: value^-1/2, its sign by the seed; counts its calls."""
+
+    what, error_label = "coin", "error"
+    own = ("halving", "exact", "auto", "broken")
+
+    def __init__(self):
+        super().__init__(unit_cube(0.5, 1.0), workers=1)
+        self.calls = []
+
+    def technique(self, name):
+        def ask(value, seed):
+            self.calls.append((name, value, seed))
+            if name == "broken" and value > 1:
+                raise OptionError("value: found too much")
+            off = 0.0 if name == "exact" else value**-0.5
+            return Answer(np.full((4, 1), 1.0 + (off if seed % 2 else -off)), {"rays": int(value)}, off)
+
+        kind = "auto" if name == "auto" else "ours"
+        return Technique(name, "samples", (1.0, 4.0, 16.0), ask, kind, seeded=name != "exact")
+
+
+def test_records_grow_and_are_not_run_again(tmp_path):
+    coin, judge = Coin(), Reference("truth", np.ones((4, 1)))
+    runs, notes = measure(coin, judge, [("halving", None)], seeds=(0, 1), repeats=2)
+    assert len(runs) == 12 and not notes
+    assert {run.error for run in runs} == {1.0, 0.5, 0.25}
+    path = tmp_path / "records.csv"
+    write_runs(path, runs)
+    again = read_runs(path)
+    assert [run.place for run in again] == [run.place for run in runs]
+    asked = len(coin.calls)
+    more, _ = measure(coin, judge, [("halving", None), ("exact", [4.0])], seeds=(0, 1), repeats=2, before=again)
+    assert len(more) == 14
+    assert [call[0] for call in coin.calls[asked:]] == ["exact"] * 3  # one in vain, two repeats, one seed
+    assert [replace(a, seconds=0) for a in more[:12]] == [replace(a, seconds=0) for a in again]
+    # A record from the beginning has the same counts and errors.
+    fresh, _ = measure(Coin(), judge, [("halving", None), ("exact", [4.0])], seeds=(0, 1), repeats=2)
+    assert [(r.place, r.rays, r.error) for r in fresh] == [(r.place, r.rays, r.error) for r in more]
+
+
+def test_what_fails_is_left_out_with_its_reason():
+    runs, notes = measure(Coin(), Reference("truth", np.ones((4, 1))), [("broken", None), ("exact", [1.0])], repeats=1)
+    assert [run.place[:2] for run in runs] == [("broken", 1.0), ("exact", 1.0)]
+    assert "found too much" in notes[0]
+
+
+def test_dear_settings_are_left_out():
+    runs, notes = measure(Coin(), Reference("truth", np.ones((4, 1))), [("halving", None)], repeats=3, limit=0.0)
+    assert {run.value for run in runs} == {1.0} and len(runs) == 3
+    assert "4, 16 left out" in notes[0]
+
+
+def test_points_and_the_ratio_of_auto():
+    runs, _ = measure(Coin(), Reference("truth", np.ones((4, 1))), [("halving", None), ("auto", [4.0])], seeds=(0, 1))
+    runs = [replace(run, seconds=run.value * (3.0 if run.kind == "auto" else 1.0)) for run in runs]
+    points = points_of(runs)
+    assert [(p.method, p.value, p.error, p.runs) for p in points][-1] == ("auto", 4.0, 0.5, 6)
+    assert [ratio for _, ratio in auto_ratios(points)] == [pytest.approx(3.0)]
+
+
+def test_chart_draws_every_technique_and_zero_errors():
+    runs, _ = measure(Coin(), Reference("truth", np.ones((4, 1))), [(n, None) for n in ("halving", "exact", "auto")])
+    figure = Figure(layout="constrained")
+    draw_chart(figure, points_of(runs), title="t", label="e", floor=0.01)
+    figure.savefig("/dev/null", format="png")
+    texts = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert any(text.startswith("halving, slope") or text == "halving" for text in texts)
+    assert any("chooses itself" in text for text in texts)
+    assert figure.axes[0].get_xscale() == figure.axes[0].get_yscale() == "log"
+
+
+def test_broken_records_are_refused(tmp_path):
+    path = tmp_path / "records.csv"
+    path.write_text("method,value\nrays,1\n")
+    with pytest.raises(InputError, match="no record of runs"):
+        read_runs(path)
+
+
+def test_digest_tells_scenes_apart():
+    scene = unit_cube(0.5, 1.0)
+    assert scene_digest(scene) == scene_digest(unit_cube(0.5, 1.0))
+    other = replace(scene, surfaces=(replace(scene.surfaces[0], material=diffuse("x", 0.6)), *scene.surfaces[1:]))
+    assert scene_digest(other) != scene_digest(scene)
+    assert scene_digest(replace(scene, notes=("read from a file",))) == scene_digest(scene)
+
+
+def test_page_is_whole_and_escaped():
+    page = html_page("a < b", "<?xml?><svg>x</svg>", {"T": [{"m": "<rays>", "n": "1.5"}]}, ["n & m"], {"cores": 2})
+    assert page.startswith("<!doctype html>") and "<svg>x</svg>" in page and "<?xml" not in page
+    assert "&lt;rays&gt;" in page and "n &amp; m" in page and "http" not in page
