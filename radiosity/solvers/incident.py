@@ -31,6 +31,28 @@ FEW_ELEMENTS, MORE_POINTS = 256, 16
 
 # Generalised golden ratio in two dimensions.
 _G2 = 1.3247179572447460
+_GAUSS = 0.5 / math.sqrt(3.0)
+
+
+@njit(nogil=True, cache=True)
+def _smooth_points(corners, piece_start, element_piece, first, last, out, fits):
+    """Gauss's 2 x 2 points of elements that are one parallelogram, whose weights are equal; ``fits`` tells them."""
+    for e in range(first, last):
+        a = piece_start[element_piece[e]]
+        fits[e - first] = False
+        if element_piece[e + 1] != element_piece[e] + 1 or piece_start[element_piece[e] + 1] != a + 4:
+            continue
+        gap = size = 0.0
+        for axis in range(3):
+            gap += abs(corners[a, axis] + corners[a + 2, axis] - corners[a + 1, axis] - corners[a + 3, axis])
+            size += abs(corners[a + 2, axis] - corners[a, axis])
+        fits[e - first] = gap <= 1e-3 * size
+        for k in range(4):
+            u, v = 0.5 + (_GAUSS if k & 1 else -_GAUSS), 0.5 + (_GAUSS if k & 2 else -_GAUSS)
+            for axis in range(3):
+                out[(e - first) * 4 + k, axis] = (1.0 - v) * (
+                    (1.0 - u) * corners[a, axis] + u * corners[a + 1, axis]
+                ) + v * ((1.0 - u) * corners[a + 3, axis] + u * corners[a + 2, axis])
 
 
 @njit(nogil=True, cache=True)
@@ -54,16 +76,19 @@ def _points(mesh: PatchMesh, first: int, last: int, count: int, seed: int) -> tu
     return points, np.repeat(mesh.element_normal[first:last], count, axis=0)
 
 
-def _from_light(light: Light, points: FloatArray, normals: FloatArray, tracer: EmbreeAccelerator, k: int) -> FloatArray:
-    """Irradiance per unit power at points, from a light without surface or one sample of it."""
+def _from_light(
+    light: Light, points: FloatArray, normals: FloatArray, tracer: EmbreeAccelerator, k: int
+) -> tuple[FloatArray, FloatArray]:
+    """Irradiance per unit power at points, from a light without surface or one sample of it: unoccluded, and seen."""
     start = points + tracer.offset * normals
     if light.kind == "directional":
         assert light.direction is not None
         toward = np.broadcast_to(-light.direction, points.shape)
         cosine = np.maximum(np.einsum("ij,ij->i", normals, toward), 0.0)
         lit = np.flatnonzero(cosine > 0)
-        cosine[lit[tracer.occluded(start[lit], toward[lit], np.inf)]] = 0.0
-        return cosine
+        seen = cosine.copy()
+        seen[lit[tracer.occluded(start[lit], toward[lit], np.inf)]] = 0.0
+        return cosine, seen
     assert light.position is not None
     place = light.position
     length = 1.0
@@ -85,8 +110,30 @@ def _from_light(light: Light, points: FloatArray, normals: FloatArray, tracer: E
         axis = (light.end - light.position) / length
         value *= np.sqrt(np.maximum(1.0 - ((toward @ axis) / safe) ** 2, 0.0))
     lit = np.flatnonzero(value > 0)
-    value[lit[tracer.occluded(start[lit], place - start[lit], 1.0)]] = 0.0
-    return value
+    seen = value.copy()
+    seen[lit[tracer.occluded(start[lit], place - start[lit], 1.0)]] = 0.0
+    return value, seen
+
+
+def _light_means(
+    light: Light, mesh: PatchMesh, first: int, last: int, seed: int, tracer: EmbreeAccelerator
+) -> FloatArray:
+    """Mean irradiance (elements,) per unit power, from a light without surface.
+
+    Points at random places of their strata see how much of the light is hidden; what is not hidden
+    is smooth and integrated by Gauss's rule, on elements that are parallelograms.
+    """
+    points, normals = _points(mesh, first, last, POINTS, seed)
+    smooth, fits = np.zeros_like(points), np.zeros(last - first, dtype=np.bool_)
+    _smooth_points(mesh.corners, mesh.piece_start, mesh.element_piece, first, last, smooth, fits)
+    total = np.zeros(last - first)
+    samples = POINTS if light.kind == "linear" else 1
+    for k in range(samples):
+        whole, seen = (v.reshape(-1, POINTS).mean(axis=1) for v in _from_light(light, points, normals, tracer, k))
+        better = _from_light(light, smooth, normals, tracer, k)[0].reshape(-1, POINTS).mean(axis=1)
+        share = np.divide(seen, whole, out=np.zeros_like(seen), where=whole > 0)
+        total += np.where(fits & (whole > 0), better * share, seen) / samples
+    return total
 
 
 def _from_sky(
@@ -155,10 +202,7 @@ def incident_irradiance(
     for first in range(0, mesh.element_count, step):
         last = min(first + step, mesh.element_count)
         for light in scene.lights:
-            points, normals = _points(mesh, first, last, POINTS, seed)
-            samples = POINTS if light.kind == "linear" else 1
-            value = sum(_from_light(light, points, normals, tracer, k) for k in range(samples)) / samples
-            out[first:last] += np.asarray(value).reshape(-1, POINTS).mean(axis=1)[:, None] * light.power
+            out[first:last] += _light_means(light, mesh, first, last, seed, tracer)[:, None] * light.power
     if sky is not None:
         shader = Shader(Geometry.from_scene(scene))
         count = POINTS if mesh.element_count > FEW_ELEMENTS else MORE_POINTS
