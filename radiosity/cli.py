@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from radiosity.chart_command import chart
+from radiosity.irradiance_command import irradiance
 from radiosity.reproduce import REPRODUCTIONS
 from radiosity.shadow_command import shadow
 from workbench.errors import InputError, OptionError, WorkbenchError
@@ -421,6 +422,7 @@ def reproduce(name: str, directory: Path | None, quick: bool) -> None:
 
 
 main.add_command(shadow)
+main.add_command(irradiance)
 main.add_command(chart)
 
 
