@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from radiosity.chart_command import chart
-from radiosity.irradiance_command import irradiance
+from radiosity.render_command import render
 from radiosity.reproduce import REPRODUCTIONS
 from radiosity.shadow_command import shadow
 from workbench.errors import InputError, OptionError, WorkbenchError
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 BAD_INPUT = 2
-_GIVEN = click.core.ParameterSource.COMMANDLINE
 INTERRUPTED = 130
 
 
@@ -114,20 +113,6 @@ def main() -> None:
 @click.option(
     "--method", type=click.Choice(["auto", "progressive", "direct"]), default="auto", show_default=True, help="Solver."
 )
-@click.option(
-    "--error",
-    type=click.FloatRange(min=0, max=1, min_open=True, max_open=True),
-    callback=_finite,
-    metavar="E",
-    help="Refine until the error of the irradiance (RMS over the surfaces / mean) is below E.",
-)
-@click.option(
-    "--budget-seconds",
-    type=click.FloatRange(min=0, min_open=True),
-    callback=_finite,
-    metavar="S",
-    help="Do the best that fits into S seconds and say the error reached.",
-)
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Threads.  [default: all cores]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of the rays.")
 @click.option("--json", "json_path", metavar="FILE", help="Write the run's record here too; - is standard output.")
@@ -141,8 +126,6 @@ def solve(
     rays: int,
     tolerance: float,
     method: str,
-    error: float | None,
-    budget_seconds: float | None,
     workers: int | None,
     seed: int,
     json_path: str | None,
@@ -158,9 +141,6 @@ def solve(
     """
     if elements is not None and max_edge is not None:
         raise OptionError("--elements and --max-edge: found both, expected one; leave one out")
-    knob = error is not None or budget_seconds is not None
-    if knob and click.get_current_context().get_parameter_source("tolerance") is _GIVEN:
-        raise OptionError("--tolerance and --error: found both, expected one; the error decides the tolerance")
     import workbench
 
     start = time.perf_counter()
@@ -181,16 +161,12 @@ def solve(
             "max_edge": max_edge,
             "rays": rays,
             "tolerance": tolerance,
-            "error": error,
-            "budget_seconds": budget_seconds,
             "seed": seed,
         }
         previous = None
         if resume:
             previous = radiosity.Solution.load(directory)
             options |= _asked_before(previous.record.settings, options)
-        if options["error"] is not None or options["budget_seconds"] is not None:
-            del options["tolerance"]
         with _progress() as report:
             solution = radiosity.solve(
                 loaded,
@@ -213,7 +189,7 @@ def solve(
 def _asked_before(settings: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
     """The options of the earlier run that this command line leaves open."""
     context = click.get_current_context()
-    given = {name for name in options if context.get_parameter_source(name) is _GIVEN}
+    given = {name for name in options if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE}
     if given & {"elements", "max_edge"}:  # one of the two stands for both
         given |= {"elements", "max_edge"}
     return {name: settings[name] for name in options if name not in given and name in settings}
@@ -355,7 +331,6 @@ def _share_done(first: float | None, residual: float, tolerance: float) -> float
 
 
 _ERRORS = {
-    "estimate": "error of the irradiance, RMS over the surfaces / mean",
     "remaining_bound": "light still missing, at most this share",
     "energy_imbalance": "energy book off by",
     "row_sum": "row sums of form factors",
@@ -374,11 +349,7 @@ def _summary(solution: Solution, files: list[Path]) -> str:
         f"{record.counters['shots']} shots, {record.counters['rays']} rays"
     ]
     lines.append("seconds: " + "; ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()))
-    lines += [
-        f"{_ERRORS.get(name, name.replace('_', ' '))}: {_short(value)}"
-        for name, value in record.errors.items()
-        if name != "definition"
-    ]
+    lines += [f"{_ERRORS.get(name, name.replace('_', ' '))}: {_short(value)}" for name, value in record.errors.items()]
     lines += [f"{path}" for path in files]
     return "\n".join(lines)
 
@@ -421,185 +392,9 @@ def reproduce(name: str, directory: Path | None, quick: bool) -> None:
         click.echo(str(path))
 
 
+main.add_command(render)
 main.add_command(shadow)
-main.add_command(irradiance)
 main.add_command(chart)
-
-
-# ---- render -----------------------------------------------------------------------------------
-
-
-@main.command()
-@click.argument("scene")
-@click.option("-o", "--output", "path", required=True, type=click.Path(path_type=Path), metavar="FILE.png")
-@click.option(
-    "--direct-only", is_flag=True, required=True, help="Lights, shadows, mirrors and glass; nothing between walls."
-)
-@click.option(
-    "--sampling",
-    type=click.Choice(["aliased", "rows", "supersampled", "adaptive", "atomic"]),
-    default="atomic",
-    show_default=True,
-    help="One ray a pixel; the same row by row with counted plane-vertex checks; a square of rays a pixel; adaptive "
-    "sampling; atomic adaptive sampling.",
-)
-@click.option(
-    "--side", type=click.IntRange(1, 64), default=4, show_default=True, help="Rays each way, if supersampled."
-)
-@click.option(
-    "--atomic",
-    "components",
-    default="shadows,cast,reflection,refraction",
-    show_default=True,
-    metavar="LIST",
-    help="What atomic adaptive sampling may assume.",
-)
-@click.option("--whole-tree", is_flag=True, help="Assume down the whole ray tree, not at its top only.")
-@click.option(
-    "--normal-angle",
-    type=click.FloatRange(0, 180, min_open=True),
-    callback=_finite,
-    metavar="DEG",
-    help="Assume nothing where normals differ by more than this.  [default: no such criterion]",
-)
-@click.option("--shared-boundary", is_flag=True, help="Also cut pixels on whose boundary a neighbour's samples differ.")
-@click.option(
-    "--threshold",
-    type=click.FloatRange(min=-1, max=1),
-    callback=_finite,
-    default=0.06,
-    show_default=True,
-    metavar="T",
-    help="Cut pixels whose corners differ by more than this share of white.",
-)
-@click.option("--level", type=click.IntRange(1, 8), default=3, show_default=True, help="Of subdivision; 3: 25 samples.")
-@click.option("--depth", type=click.IntRange(0, 16), default=3, show_default=True, help="Reflections in a row.")
-@click.option(
-    "--shadow-error",
-    type=click.FloatRange(0, 1, min_open=True, max_open=True),
-    callback=_finite,
-    default=0.01,
-    show_default=True,
-    metavar="E",
-    help="Wanted error of soft shadows, relative to the mean irradiance.",
-)
-@click.option(
-    "--light-samples",
-    type=click.IntRange(1, 4096),
-    metavar="K",
-    help="Rather take K shadow rays to each linear or area light, as in the papers.",
-)
-@click.option(
-    "--bundle", type=click.IntRange(1, 4096), default=1, show_default=True, help="Rays of a fuzzy reflection."
-)
-@click.option(
-    "--falloff/--no-falloff", default=None, help="Of point lights, by distance squared.  [default: no for .nff files]"
-)
-@click.option(
-    "--white",
-    type=click.FloatRange(min=0, min_open=True),
-    callback=_finite,
-    metavar="L",
-    help="Radiance shown as white.  [default: found by a coarse look]",
-)
-@click.option("--width", type=click.IntRange(1, 16384), metavar="PIXELS", help="[default: the camera's]")
-@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Threads.  [default: all cores]")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of fuzzy rays.")
-@click.option("--json", "json_path", metavar="FILE", help="Write the run's record here; - is standard output.")
-def render(
-    scene: str,
-    path: Path,
-    direct_only: bool,
-    sampling: str,
-    side: int,
-    components: str,
-    whole_tree: bool,
-    normal_angle: float | None,
-    shared_boundary: bool,
-    threshold: float,
-    level: int,
-    depth: int,
-    shadow_error: float,
-    light_samples: int | None,
-    bundle: int,
-    falloff: bool | None,
-    white: float | None,
-    width: int | None,
-    workers: int | None,
-    seed: int,
-    json_path: str | None,
-) -> None:
-    """Draw SCENE through its camera into a PNG or TIFF file, without a solve.
-
-    SCENE is a scene file (TOML, NFF, OBJ, ...) or the name of a built-in scene.
-    """
-    import workbench
-    from workbench.render.atomic import AtomicOptions
-    from workbench.render.direct import render_direct
-    from workbench.render.image import check_picture_path, write_picture
-    from workbench.render.trace import TraceOptions
-
-    check_picture_path(path)
-    if json_path not in (None, "-") and not Path(str(json_path)).parent.is_dir():
-        raise InputError(f"{json_path}: found no such folder, expected one; give another --json FILE")
-    chosen = tuple(name.strip() for name in components.split(",") if name.strip())
-    atomic = AtomicOptions(chosen, whole_tree=whole_tree, similar=max(threshold, 0.0), normal_angle_deg=normal_angle)
-    start = time.perf_counter()
-    loaded = workbench.load(scene)
-    seconds_reading = time.perf_counter() - start
-    for note in loaded.notes:
-        click.echo(f"note: {note}", err=True)
-    nff = loaded.path is not None and loaded.path.suffix.lower() == ".nff"
-    options = TraceOptions(
-        depth=depth,
-        light_samples=light_samples,
-        shadow_error=shadow_error,
-        bundle=bundle,
-        falloff=not nff if falloff is None else falloff,
-        see_backs=not nff,
-        seed=seed,
-    )
-    drawn = render_direct(
-        loaded,
-        sampling=sampling,
-        options=options,
-        atomic=atomic,
-        threshold=threshold,
-        level=level,
-        shared_boundary=shared_boundary,
-        side=side,
-        white=white,
-        width=width,
-        workers=workers or os.cpu_count() or 1,
-    )
-    record = drawn.record
-    record.seconds = {"read scene": seconds_reading} | record.seconds
-    record.settings |= {"depth": depth, "light_samples": light_samples, "bundle": bundle, "seed": seed}
-    record.settings |= {"shadow_error": shadow_error, "normal_angle_deg": normal_angle}
-    record.settings |= {"falloff": options.falloff, "atomic": components, "whole_tree": whole_tree, "scene": scene}
-    write_picture(path, drawn.pixels)
-    if json_path is not None:
-        record.write(json_path)
-    counts = record.counters
-    lines = [
-        f"{loaded.name}: {drawn.pixels.shape[1]} x {drawn.pixels.shape[0]}, "
-        f"{record.results['samples_per_pixel']:.3g} samples a pixel; of {record.results['samples']:,} samples "
-        f"{counts['cast_rays_hit']:,} see a surface",
-        f"{counts['rays']:,} rays: {counts['cast_rays']:,} cast, {counts['shadow_rays']:,} shadow, "
-        f"{counts['reflection_rays']:,} reflected, {counts['refraction_rays']:,} refracted",
-    ]
-    if sampling == "atomic":
-        lines.append(
-            f"saved: {counts['cast_rays_saved']:,} cast, {counts['shadow_rays_saved']:,} shadow, "
-            f"{counts['reflection_rays_saved']:,} reflected, {counts['refraction_rays_saved']:,} refracted"
-        )
-    if sampling == "rows":
-        lines.append(
-            f"cast rays row by row: {counts['polygon_tests']:,} polygon tests, {counts['tests_avoided']:,} avoided by "
-            f"{counts['plane_vertex_checks']:,} plane-vertex checks; {record.results['first_pass_s']:.2f} s"
-        )
-    lines.append("seconds: " + "; ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()))
-    click.echo("\n".join([*lines, str(path)]), err=json_path == "-")
 
 
 # ---- view, scenes, doctor ---------------------------------------------------------------------

@@ -8,6 +8,7 @@ rays whose hits read the solution, or in closed form over all elements where the
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -33,7 +34,7 @@ from workbench.shadow.lights import Sender, SphereLight, lights_of_scene
 from workbench.shadow.occlusion import ROUNDING, Shader
 from workbench.shadow.sky import SkyLight
 
-__all__ = ["Gatherer", "IrradianceEstimate"]
+__all__ = ["Bundled", "Direct", "Gatherer", "IrradianceEstimate"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -100,6 +101,34 @@ class IrradianceEstimate:
     seconds: dict[str, float]
 
 
+@dataclass(frozen=True)
+class Bundled:
+    """What hemisphere bundles found: see :class:`IrradianceEstimate` for ``distance``.
+
+    ``indirect``, its ``standard_error`` and what came from the ``sky`` are (n, bands), in W/m2.
+    """
+
+    indirect: FloatArray
+    standard_error: FloatArray
+    distance: FloatArray
+    sky: FloatArray
+
+
+@dataclass(frozen=True)
+class Direct:
+    """Light straight from emitters and sky.
+
+    ``irradiance`` and ``standard_error`` are (n, bands), in W/m2; ``state`` (n, lights) is Woo's, see
+    :class:`workbench.shadow.occlusion.OcclusionState`.  Where ``crowded`` (n,), the sky is cut by too
+    much to be exact: it is not in ``irradiance``, and left to the rays of bundles.
+    """
+
+    irradiance: FloatArray
+    standard_error: FloatArray
+    state: NDArray[np.int8]
+    crowded: NDArray[np.bool_]
+
+
 class Gatherer:
     """A solution made ready for many questions about the light at points.
 
@@ -119,15 +148,27 @@ class Gatherer:
     """
 
     def __init__(self, solution: Solution, *, workers: int | None = None, seed: int = 0) -> None:
-        scene, mesh = solution.scene, solution.mesh
+        scene = solution.scene
         if not scene.surfaces:
             raise InputError(
                 f"{scene.name}: found a solution without its scene; its file was moved, so solve the scene again"
             )
-        self.solution, self.seed = solution, seed
+        self.seed = seed
         self.geometry = Geometry.from_scene(scene)
         self.shader = Shader(self.geometry, workers)
         self.workers = self.shader.workers
+        self._read(solution)
+
+    def reading(self, solution: Solution) -> Gatherer:
+        """This gatherer reading another solution of the same scene: what is ready of the scene is shared."""
+        other = copy.copy(self)
+        other.__dict__.pop("_exact", None)
+        other._read(solution)
+        return other
+
+    def _read(self, solution: Solution) -> None:
+        scene, mesh = solution.scene, solution.mesh
+        self.solution = solution
         self.lookup = ElementLookup.build(self.geometry, mesh)
         gathered = {
             name
@@ -203,7 +244,9 @@ class Gatherer:
             raise OptionError(f"rays: found {rays}, expected 1 to {MOST_RAYS}")
         counters, seconds = Counters(), {}
         begin = time.perf_counter()
-        direct, direct_error, crowded = self._direct(place, facing, own_polygon, error, counters)
+        who = np.full(len(place), -1, dtype=np.int64) if own_polygon is None else own_polygon
+        straight = self.direct(place, facing, own_polygon=who, error=error, counters=counters)
+        direct, direct_error, crowded = straight.irradiance, straight.standard_error, straight.crowded
         seconds["direct"] = time.perf_counter() - begin
         begin = time.perf_counter()
         indirect, doubt, distance, method, from_sky = self._indirect(
@@ -215,29 +258,50 @@ class Gatherer:
             direct + indirect, direct, indirect, np.hypot(direct_error, doubt), distance, method, counters, seconds
         )
 
-    # ---- direct light ---------------------------------------------------------------------------
+    def indirect(self, points: FloatArray, normals: FloatArray, *, rays: int, counters: Counters) -> Bundled:
+        """Indirect irradiance alone, for callers that find direct light elsewhere; arguments are not checked.
 
-    def _direct(
-        self, points: FloatArray, normals: FloatArray, own: ArrayLike | None, error: float, counters: Counters
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Irradiance straight from lights and sky, its standard error, and where the sky is left to rays."""
+        Parameters
+        ----------
+        points, normals : (n, 3) float
+            Normals of unit length.
+        rays : int
+            Rays a point, rounded up to a power of two.
+        counters : Counters
+            The rays are added here.
+        """
+        shape = (len(points), self.reflected.shape[1])
+        if not self.reflected.any() and self.sky is None:
+            return Bundled(np.zeros(shape), np.zeros(shape), np.full(len(points), math.inf), np.zeros(shape))
+        bundle = self._empty_bundle(points, normals, np.ones(len(points), dtype=bool))
+        self._extend(bundle, np.arange(len(points)), max(_power_of_two(rays), 2 * RUNS), counters)
+        mean, spread, sky = bundle.result()
+        return Bundled(mean, spread, bundle.distance(), sky)
+
+    def direct(
+        self, points: FloatArray, normals: FloatArray, *, own_polygon: ArrayLike, error: float, counters: Counters
+    ) -> Direct:
+        """Irradiance straight from lights and sky alone; arguments as in :meth:`irradiance`, but not checked."""
         shape = (len(points), self.reflected.shape[1])
         value, doubt, crowded = np.zeros(shape), np.zeros(shape), np.zeros(len(points), dtype=bool)
-        if self.lights:
+        state = np.ones((len(points), len(self.lights)), dtype=np.int8)
+        if self.lights and len(points):
             found = self.shader.estimate(
-                points, normals, self.lights, "auto", error=DIRECT_SHARE * error, seed=self.seed, own_polygon=own
-            )
+                points, normals, self.lights, "auto", error=DIRECT_SHARE * error, seed=self.seed,
+                own_polygon=own_polygon,
+            )  # fmt: skip
             counters.merge(found.counters)
+            state = found.state
             value += found.irradiance
             doubt += found.standard_error
-        if self.sky is not None:
+        if self.sky is not None and len(points):
             shares = self.sky.shares(
-                self.shader, points, normals, own_polygon=own, error=DIRECT_SHARE * error, counters=counters
+                self.shader, points, normals, own_polygon=own_polygon, error=DIRECT_SHARE * error, counters=counters
             )
             crowded = np.isnan(shares[:, 0])
             shares[crowded] = 0.0
             value += self.sky.irradiance(shares)
-        return value, doubt, crowded
+        return Direct(value, doubt, state, crowded)
 
     # ---- indirect light -------------------------------------------------------------------------
 
@@ -257,16 +321,7 @@ class Gatherer:
         nothing = np.zeros((n, bands))
         if not self.reflected.any() and not crowded.any():
             return nothing, nothing.copy(), np.full(n, math.inf), "none", nothing
-        bundle = _Bundle(
-            points,
-            normals,
-            np.zeros((n, RUNS, bands)),
-            np.zeros((n, RUNS, 2)),
-            np.zeros((n, 2)),
-            np.zeros(n, dtype=np.int64),
-            self.sky if crowded.any() else None,
-            crowded,
-        )
+        bundle = self._empty_bundle(points, normals, crowded)
         if rays is not None:
             self._extend(bundle, np.arange(n), max(_power_of_two(rays), 2 * RUNS), counters)
             mean, spread, from_sky = bundle.result()
@@ -300,6 +355,19 @@ class Gatherer:
             self._extend(bundle, np.flatnonzero(target == total), int(min(total, MOST_RAYS)), counters)
         mean, spread, from_sky = bundle.result()
         return mean, spread, bundle.distance(), "rays", from_sky
+
+    def _empty_bundle(self, points: FloatArray, normals: FloatArray, crowded: NDArray[np.bool_]) -> _Bundle:
+        n, bands = len(points), self.reflected.shape[1]
+        return _Bundle(
+            points,
+            normals,
+            np.zeros((n, RUNS, bands)),
+            np.zeros((n, RUNS, 2)),
+            np.zeros((n, 2)),
+            np.zeros(n, dtype=np.int64),
+            self.sky if crowded.any() else None,
+            crowded,
+        )
 
     @cached_property
     def _exact(self) -> _Groups:

@@ -7,7 +7,7 @@ Lengths are in the scene's own unit, metres unless the scene says otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -259,7 +259,8 @@ class Scene:
     ``closed`` says that the author declares the surfaces an enclosure: no light escapes, every
     row of form factors sums to 1.  ``background`` is the radiance seen where no surface is, unless
     there is a ``sky``.
-    ``notes`` tell, a sentence each, what the reader changed or supposed.
+    ``notes`` tell, a sentence each, what the reader changed or supposed.  ``cameras`` are further
+    ones by their names; ``camera`` is the one to use unless another is asked for.
     """
 
     name: str
@@ -272,6 +273,7 @@ class Scene:
     path: Path | None = None
     notes: tuple[str, ...] = ()
     sky: Sky | None = None
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
 
     @property
     def has_emitter(self) -> bool:

@@ -15,6 +15,8 @@ Keys at the top::
                                     # "cie-1" to "cie-15" (CIE S 011); zenith_radiance [W/(m2 sr)] or
                                     # horizontal_irradiance [W/m2] (of the sky, without the sun's beam);
                                     # ground_reflectance = 0, up = [0, 0, 1], sun_direction (to the sun)
+    [cameras.NAME]                  # further ones, with the same keys; the first of them is used where
+                                    # there is no [camera]
     [materials.NAME]                # reflectance, emission [W/m2, radiant exitance], specular,
                                     # exponent = inf, transmittance, ior = 1, two_sided = false
     [[surface]]                     # name, material, one shape, transform
@@ -386,6 +388,7 @@ class _File(_Table):
     background: Bands = np.zeros(1)
     camera: _CameraTable | None = None
     sky: _SkyTable | None = None
+    cameras: dict[str, _CameraTable] = {}
     materials: dict[str, _MaterialTable] = {}
     surface: list[_SurfaceTable] = []
     light: list[dict[str, Any]] = []
@@ -729,16 +732,13 @@ class _Builder:
         ground = self.spread(table.ground_reflectance)
         return Sky(table.type, ground, up=table.up, sun_direction=table.sun_direction, **given)
 
-    def camera(self) -> Camera | None:
-        table = self.table.camera
-        if table is None:
-            return None
+    def camera(self, table: _CameraTable, key: Key) -> Camera:
         view = table.look_at - table.eye
         length = float(np.linalg.norm(view))
         if not length > 0:
-            self.fail(("camera", "look_at"), "found the same point as eye, expected another")
+            self.fail((*key, "look_at"), "found the same point as eye, expected another")
         if np.linalg.norm(np.cross(view / length, table.up)) < 1e-9:
-            self.fail(("camera", "up"), "found a vector along the line of sight, expected one across it")
+            self.fail((*key, "up"), "found a vector along the line of sight, expected one across it")
         return Camera(table.eye, table.look_at, table.up, table.fov, table.width, table.height)
 
 
@@ -817,14 +817,17 @@ def load_scene(path: str | Path) -> Scene:
         builder = _Builder(path, file, lights)
         point_lights, emitters = builder.light_records()
         surfaces = tuple(itertools.chain(builder.surfaces(), emitters))
-        camera, sky = builder.camera(), builder.sky()
+        camera = builder.camera(file.camera, ("camera",)) if file.camera is not None else None
+        cameras = {name: builder.camera(each, ("cameras", name)) for name, each in file.cameras.items()}
+        sky = builder.sky()
     if not surfaces:
         raise SceneError("found no surface, expected at least one [[surface]]; add it", path=path, key="surface")
     return Scene(
         name=file.name or path.stem,
         surfaces=surfaces,
         lights=tuple(point_lights),
-        camera=camera,
+        camera=camera or next(iter(cameras.values()), None),
+        cameras=cameras,
         background=builder.spread(file.background),
         bands=builder.bands,
         closed=file.closed,

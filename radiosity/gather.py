@@ -1,0 +1,644 @@
+"""The final gather: a picture's direct light pixel by pixel, its indirect light from a coarse solution.
+
+Each ray from the eye ends on diffuse surfaces; neighbouring ends of a pixel on one surface are one
+*fragment*.  A fragment's direct light is found by the shadow module: in closed form where nothing
+lies between (NOT_INSHADOW), zero in shadow (INSHADOW), cut exactly or sampled where Woo's state is
+COMPLEX_SHADOW.  Indirect irradiance is gathered by hemisphere bundles that read the solution at
+their hits, but only at *nodes*: *atomic adaptive sampling* (A. Woo, IEEE CG&A 13(5), 1993) carried
+to components of a gather.  Nodes begin on a coarse lattice of blocks of pixels; a block is cut in
+four, for this component alone, where its nodes disagree with what their neighbours on the same sheet
+foretell, or stand nearer to what lights them than they stand to each other (the harmonic mean
+distance of an irradiance cache: G. J. Ward, F. M. Rubinstein and R. D. Clear, SIGGRAPH 1988).
+Irradiance is interpolated, never radiance: reflectance multiplies last.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import pickle
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from radiosity import _picture_kernels as kernels
+from radiosity.regather import regathered
+from radiosity.sensors import Direct, Gatherer
+from radiosity.solvers.solution import Solution
+from workbench.counters import Counters
+from workbench.errors import InputError, OptionError
+from workbench.geometry.flat import Geometry
+from workbench.memory import require_memory
+from workbench.render.camera import PinholeRays
+from workbench.render.trace import TraceOptions, Tracer
+from workbench.sampling.sequences import sobol
+
+__all__ = ["GatherOptions", "Picture", "PictureGatherer"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+CURVED = 64
+"""Faces from which a surface is one sheet, whatever the planes of its facets."""
+NEIGHBOURS = 10
+"""Nodes between which indirect irradiance is interpolated."""
+APART = 1e6
+"""Distance between sheets in the tree of nodes. [pixels]"""
+STEP = 0.1
+"""Relative step of direct light to a neighbouring pixel, or inside one, from which it is sampled inside."""
+DIRECT_PLACES = 16
+"""Places in a subdivided pixel at which direct light is found."""
+SPACING = 0.5
+"""Nodes stand no further apart than this share of the harmonic mean distance to what lights them."""
+NOISE = 2.5
+"""Standard errors of a node by which it may differ from what was foretold without being uneven."""
+TILE = 256
+"""Side of a tile. [pixels]"""
+TILES_IN_MEMORY = 8
+_PIXEL_BYTES = 16000
+"""Memory that a pixel of a tile takes while it is drawn, edges counted."""
+DEPTH = 6
+"""Reflections and refractions in a row."""
+
+
+@dataclass(frozen=True)
+class GatherOptions:
+    """How well to gather.
+
+    Parameters
+    ----------
+    error : float
+        Wanted error: root mean square over the pixels of each one's relative error.
+    rays : int, optional
+        Rays of a hemisphere bundle; as many as ``error`` needs unless given.
+    atomic : bool
+        Interpolate indirect irradiance between nodes; otherwise every fragment is gathered.
+    indirect : bool
+        Off: direct light only.
+    see_backs : bool
+        Whether one-sided faces are seen from behind, black; otherwise the eye looks through them,
+        and only the eye: light is blocked all the same.
+    """
+
+    error: float = 0.02
+    rays: int | None = None
+    atomic: bool = True
+    indirect: bool = True
+    see_backs: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.error < 1:
+            raise OptionError(f"error: found {self.error}, expected a number between 0 and 1")
+        if self.rays is not None and not 1 <= self.rays <= 65536:
+            raise OptionError(f"rays: found {self.rays}, expected 1 to 65536")
+
+    @property
+    def passes(self) -> int:
+        """Rounds in which the solution is gathered again, see :func:`radiosity.regather.regathered`."""
+        return int(np.clip(round(math.log2(0.32 / self.error)), 1, 6))
+
+    @property
+    def bundle(self) -> int:
+        """Rays of a hemisphere bundle."""
+        if self.rays is not None:
+            return self.rays
+        # A net's error falls as rays^-3/4; a fit averages over about NEIGHBOURS / 3 nodes.
+        return int(np.clip(2 ** round(math.log2(256 * (0.02 / self.error) ** (4 / 3))), 64, 4096))
+
+    @property
+    def fuzzy_rays(self) -> int:
+        """Rays of a fuzzy reflection."""
+        return int(np.clip(2 ** round(math.log2(16 * 0.02 / self.error)), 4, 64))
+
+    @property
+    def subsamples(self) -> int:
+        """Rays from the eye in a pixel that shows an edge."""
+        return 16 if self.error > 0.05 else 64
+
+
+@dataclass
+class _Fragments:
+    """What the rays of one pixel see of one sheet, a row each.
+
+    ``sheet`` numbers what irradiance is continuous on: a plane, or a curved surface, seen directly
+    or by one and the same first mirror.  ``x, y`` are places in the picture, ``footprint`` is the size
+    of a pixel there, and ``gain`` (n, bands) what irradiance is multiplied by in the pixel.
+    """
+
+    pixel: IntArray
+    sheet: IntArray
+    polygon: IntArray
+    x: FloatArray
+    y: FloatArray
+    points: FloatArray
+    normals: FloatArray
+    footprint: FloatArray
+    gain: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+    def take(self, rows: NDArray) -> _Fragments:
+        return _Fragments(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    @staticmethod
+    def joined(parts: list[_Fragments]) -> _Fragments:
+        names = _Fragments.__dataclass_fields__
+        return _Fragments(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass
+class _Seen:
+    """What rays from the eye met: radiance (n, bands) that needs no gather, a mark (n,) by which rays
+    that saw the same sheets are alike, and fragments, of which ``ray`` tells the ray."""
+
+    radiance: FloatArray
+    mark: NDArray[np.uint64]
+    fragments: _Fragments
+    ray: IntArray
+
+
+class PictureGatherer:
+    """A solution made ready to be drawn.
+
+    Parameters
+    ----------
+    solution : Solution
+        With its scene, of 1 or 3 bands.
+    options : GatherOptions, optional
+    workers : int, optional
+        Threads, all cores by default; the picture does not depend on it.
+    seed : int
+        Of the rays.
+    """
+
+    def __init__(
+        self,
+        solution: Solution,
+        options: GatherOptions | None = None,
+        *,
+        workers: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.options = options or GatherOptions()
+        self.gatherer = Gatherer(solution, workers=workers, seed=seed)
+        if self.options.indirect and self.options.passes:
+            self.gatherer = regathered(
+                solution, passes=self.options.passes, error=self.options.error, gatherer=self.gatherer, seed=seed
+            )
+        self.scene, self.geometry = solution.scene, self.gatherer.geometry
+        self.workers, self.seed = self.gatherer.workers, seed
+        self.bands = solution.mesh.bands
+        materials = [surface.material for surface in self.scene.surfaces]
+        fuzzy = any(m.specular.any() and math.isfinite(m.exponent) for m in materials)
+        leads_on = any(m.specular.any() or m.transmittance.any() for m in materials)
+        self._tracer = Tracer(
+            self.scene,
+            TraceOptions(
+                depth=DEPTH if leads_on else 0,
+                bundle=self.options.fuzzy_rays if fuzzy else 1,
+                see_backs=self.options.see_backs,
+                seed=seed,
+            ),
+            workers=self.workers,
+        )
+        self._first = self.gatherer.shader.tracer if leads_on else None
+        self._sheets = _sheets(self.geometry)
+        self._places = sobol(self.options.subsamples, np.random.default_rng(seed))
+
+    def draw(self, rays: PinholeRays) -> Picture:
+        """The whole picture at once."""
+        picture = Picture(self, rays)
+        for _ in picture.steps():
+            pass
+        return picture
+
+    def look(self, rays: PinholeRays, x: FloatArray, y: FloatArray, pixel: IntArray, keys: IntArray) -> _Seen:
+        """Follow rays through places of the picture to the diffuse surfaces that they see."""
+        along = rays.directions(x, y)
+        ends = self._tracer.trace_to_diffuse(rays.eye, along, keys=keys)
+        sheet = 2 * self._sheets[ends.polygon] + ~ends.front
+        if self._first is not None:
+            # Behind a mirror: another sheet for each mirror and each number of reflections.
+            met = self._first.closest_hit(rays.eye, along).polygon
+            mirror = np.where(met >= 0, self.geometry.polygon_surface[met], -1) + 1
+            behind = mirror[ends.ray] * (DEPTH + 1) + ends.depth
+            sheet += np.where(ends.depth > 0, behind, 0) * (2 * int(self._sheets.max(initial=0)) + 2)
+        toward = ends.points - rays.eye
+        distance = np.linalg.norm(toward, axis=1)
+        cosine = np.abs(np.einsum("ij,ij->i", toward, ends.facing)) / np.maximum(distance, 1e-300)
+        pixel_size = float(np.linalg.norm(rays.right))
+        fragments = _Fragments(
+            pixel[ends.ray], sheet, ends.polygon, x[ends.ray], y[ends.ray], ends.points, ends.normals,
+            distance * pixel_size / np.sqrt(np.maximum(cosine, 1e-3)), ends.throughput * ends.reflectance / math.pi,
+        )  # fmt: skip
+        # What a ray saw is the sum of hashes of surfaces and sheets.
+        mark = np.zeros(len(x), dtype=np.uint64)
+        code = (sheet * (len(self.scene.surfaces) + 1) + ends.surface + 1).astype(np.uint64)
+        np.add.at(mark, ends.ray, code * np.uint64(0x9E3779B97F4A7C15) ^ (code >> np.uint64(7)))
+        return _Seen(ends.radiance, mark, fragments, ends.ray)
+
+
+def _sheets(geometry: Geometry) -> IntArray:
+    """Number of each polygon's sheet: its plane, or its surface where that is curved."""
+    first = geometry.corners[geometry.piece_start[geometry.polygon_piece_start[:-1]]]
+    level = np.einsum("ij,ij->i", geometry.polygon_normal, first) / geometry.size
+    key = np.column_stack([np.rint(geometry.polygon_normal * 1e6), np.rint(level * 1e6)])
+    sheet = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+    faces = np.bincount(geometry.polygon_surface, minlength=len(geometry.surface_name))
+    curved = faces[geometry.polygon_surface] >= CURVED
+    return np.where(curved, int(sheet.max(initial=0)) + 1 + geometry.polygon_surface, sheet)
+
+
+@dataclass
+class _Nodes:
+    """Where indirect irradiance was gathered.
+
+    ``place`` (n, 3) is the place in the picture and the sheet, ``value`` (n, 2 bands) the irradiance
+    found, first the indirect one, then that from the sky.
+    """
+
+    place: FloatArray
+    value: FloatArray
+
+    def add(self, place: FloatArray, value: FloatArray) -> None:
+        self.place, self.value = np.concatenate([self.place, place]), np.concatenate([self.value, value])
+
+    def near(self, left: float, top: float, right: float, bottom: float) -> _Nodes:
+        x, y = self.place[:, 0], self.place[:, 1]
+        inside = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+        return _Nodes(self.place[inside], self.value[inside])
+
+    def between(self, places: FloatArray, workers: int) -> FloatArray:
+        """Irradiance at places, from the nodes of their sheets; NaN where a sheet has none."""
+        out = np.full((len(places), self.value.shape[1]), np.nan)
+        if not len(self.place) or not len(places):
+            return out
+        distance, neighbour = cKDTree(self.place).query(places, k=min(NEIGHBOURS, len(self.place)), workers=workers)
+        shape = (len(places), -1)
+        kernels.local_fits(
+            np.ascontiguousarray(places[:, :2]), neighbour.reshape(shape), distance.reshape(shape), 0.5 * APART,
+            np.ascontiguousarray(self.place[:, :2]), self.value, out,
+        )  # fmt: skip
+        return out
+
+
+class Picture:
+    """A picture on its way: drawn tile by tile, first with the nodes so far, then with all.
+
+    Attributes
+    ----------
+    radiance : (h, w, bands) float
+        As good as it is yet; 0 where nothing is drawn. [W m-2 sr-1]
+    samples : dict of str to (h, w) int
+        How often each component was sampled in each pixel: ``camera`` rays, ``direct`` places,
+        ``indirect`` bundles.
+    states : (h, w, lights) int
+        Woo's state of each pixel's middle for each light, see
+        :class:`workbench.shadow.occlusion.OcclusionState`; -1 where an edge or nothing diffuse is seen.
+    tiles : list of (left, top, right, bottom)
+        [pixels]
+    drafted, finished : set of int
+        Tiles drawn with the nodes so far, and with all.
+    counters : Counters
+    """
+
+    def __init__(self, owner: PictureGatherer, rays: PinholeRays) -> None:
+        self.owner, self.rays = owner, rays
+        width, height, bands = rays.width, rays.height, owner.bands
+        require_memory(
+            float(width) * height * (8.0 * bands + 30.0 + len(owner.gatherer.lights)) + TILE**2 * _PIXEL_BYTES,
+            f"a picture of {width} x {height} pixels", "ask for a smaller --size",
+        )  # fmt: skip
+        self.radiance = np.zeros((height, width, bands))
+        self.samples = {name: np.zeros((height, width), dtype=np.int32) for name in ("camera", "direct", "indirect")}
+        self.states = np.full((height, width, len(owner.gatherer.lights)), -1, dtype=np.int8)
+        self.tiles = [
+            (x, y, min(x + TILE, width), min(y + TILE, height))
+            for y in range(0, height, TILE)
+            for x in range(0, width, TILE)
+        ]
+        self.drafted: set[int] = set()
+        self.finished: set[int] = set()
+        self.counters = Counters()
+        self._nodes = _Nodes(np.empty((0, 3)), np.empty((0, 2 * bands)))
+
+    def steps(self) -> Iterator[float]:
+        """Draw; yields after each tile how much is done, 0..1, and may be left at any time."""
+        many = len(self.tiles)
+        with tempfile.TemporaryDirectory(prefix="radiosity-") as folder:
+            waiting: dict[int, Any] = {}
+            for number in range(many):
+                if number in self.finished:
+                    continue
+                tile = _Tile(self, *self.tiles[number])
+                tile.look()
+                tile.place_nodes(self._nodes)
+                tile.reflect(self._nodes)
+                self._take(tile)
+                self.drafted.add(number)
+                if many == 1:
+                    self.finished.add(number)
+                else:
+                    # Beyond a few tiles what they see is kept on disk: memory does not grow with the picture.
+                    kept = tile.light
+                    if len(waiting) >= TILES_IN_MEMORY:
+                        path = os.path.join(folder, f"{number}.pickle")
+                        with open(path, "wb") as file:
+                            pickle.dump(kept, file)
+                        waiting[number] = path
+                    else:
+                        waiting[number] = kept
+                yield 0.9 * (number + 1) / many
+            for number in list(waiting):
+                kept = waiting.pop(number)
+                if isinstance(kept, str):
+                    with open(kept, "rb") as file:
+                        kept = pickle.load(file)
+                tile = _Tile(self, *self.tiles[number])
+                tile.light = kept
+                tile.reflect(self._nodes)
+                left, top, right, bottom = self.tiles[number]
+                self.radiance[top:bottom, left:right] = tile.radiance.reshape(bottom - top, right - left, -1)
+                self.finished.add(number)
+                yield 0.9 + 0.1 * len(self.finished) / many
+
+    def _take(self, tile: _Tile) -> None:
+        left, top, right, bottom = tile.left, tile.top, tile.left + tile.width, tile.top + tile.height
+        part = (slice(top, bottom), slice(left, right))
+        shape = (bottom - top, right - left)
+        self.radiance[part] = tile.radiance.reshape(*shape, -1)
+        for name, count in tile.samples.items():
+            self.samples[name][part] = count.reshape(shape)
+        self.states[part] = tile.states.reshape(*shape, -1)
+        self.counters.merge(tile.counters)
+
+    def state(self) -> dict[str, NDArray]:
+        """All that :meth:`resume` needs."""
+        return {
+            "radiance": self.radiance, "states": self.states, "node_place": self._nodes.place,
+            "node_value": self._nodes.value, "finished": np.array(sorted(self.finished), dtype=np.int64),
+            "drafted": np.array(sorted(self.drafted), dtype=np.int64),
+            **{f"samples_{name}": count for name, count in self.samples.items()},
+        }  # fmt: skip
+
+    def resume(self, state: Mapping[str, NDArray]) -> None:
+        """Go on from a saved :meth:`state` of the same picture.
+
+        Raises
+        ------
+        InputError
+            If the state is that of a picture of another size.
+        """
+        if state["radiance"].shape != self.radiance.shape or state["states"].shape != self.states.shape:
+            raise InputError(
+                f"resume: found a picture of shape {state['radiance'].shape}, expected {self.radiance.shape};"
+                " draw without --resume"
+            )
+        self.radiance, self.states = state["radiance"].copy(), state["states"].copy()
+        self.samples = {name: state[f"samples_{name}"].copy() for name in self.samples}
+        self._nodes = _Nodes(state["node_place"], state["node_value"])
+        self.finished, self.drafted = set(state["finished"].tolist()), set(state["drafted"].tolist())
+
+
+@dataclass
+class _Light:
+    """What a tile saw: radiance (pixels, bands) that needs no gather, fragments, and their direct irradiance.
+
+    Where a fragment is ``crowded`` (n,), the sky is not in it, see :class:`radiosity.sensors.Direct`.
+    """
+
+    radiance: FloatArray
+    fragments: _Fragments
+    direct: FloatArray
+    crowded: NDArray[np.bool_]
+
+    def asks_nodes(self, indirect: bool) -> bool:
+        return len(self.fragments) > 0 and (indirect or bool(self.crowded.any()))
+
+
+class _Tile:
+    """One rectangle of a picture."""
+
+    def __init__(self, picture: Picture, left: int, top: int, right: int, bottom: int) -> None:
+        self.owner, self.rays, self.options = picture.owner, picture.rays, picture.owner.options
+        self.left, self.top, self.width, self.height = left, top, right - left, bottom - top
+        # Blocks keep their share of the picture, whatever its resolution.
+        self.pitch = int(np.clip(2 ** round(math.log2(max(min(self.rays.width, self.rays.height), 1) / 16)), 4, 64))
+        self.counters = Counters()
+
+    def look(self) -> None:
+        """Find what the pixels see, and its direct light."""
+        shape = self.height * self.width
+        radiance = np.zeros((shape, self.owner.bands))
+        self.samples = {name: np.zeros(shape, dtype=np.int64) for name in ("camera", "direct", "indirect")}
+        whole, edges = self._whole_pixels(radiance)
+        straight = self._direct(whole)
+        direct = straight.irradiance
+        cut = np.zeros(shape, dtype=bool)
+        cut[edges] = cut[whole.pixel[self._shadow_edges(whole, direct)]] = True
+        radiance[cut] = 0.0
+        kept = ~cut[whole.pixel]
+        self.samples["camera"] += 2
+        self.samples["direct"] += np.bincount(whole.pixel, minlength=shape)
+        self.states = np.full((shape, len(self.owner.gatherer.lights)), -1, dtype=np.int8)
+        self.states[whole.pixel] = straight.state
+        parts, light, crowded = [whole.take(kept)], [direct[kept]], [straight.crowded[kept]]
+        inside = np.flatnonzero(cut)
+        step = max(1, (1 << 19) // self.options.subsamples)
+        for first in range(0, len(inside), step):
+            pixels = inside[first : first + step]
+            fragments, found, dim, places = self._divide(pixels, radiance)
+            self.samples["camera"][pixels] += self.options.subsamples
+            self.samples["direct"] += np.bincount(places, minlength=shape)
+            parts.append(fragments)
+            light.append(found)
+            crowded.append(dim)
+        self.light = _Light(radiance, _Fragments.joined(parts), np.concatenate(light), np.concatenate(crowded))
+
+    def reflect(self, nodes: _Nodes) -> None:
+        """Add what the fragments reflect, their indirect light read between nodes."""
+        fragments, arriving = self.light.fragments, self.light.direct
+        if self.light.asks_nodes(self.options.indirect) and len(nodes.place):
+            margin = 4.0 * self.pitch
+            right, bottom = self.left + self.width + margin, self.top + self.height + margin
+            near = nodes.near(self.left - margin, self.top - margin, right, bottom)
+            found = near.between(_places(fragments), self.owner.workers)
+            bands = self.owner.bands
+            if self.options.indirect:
+                arriving = arriving + found[:, :bands]
+            arriving = arriving + np.where(self.light.crowded[:, None], found[:, bands:], 0.0)
+        self.radiance = self.light.radiance.copy()
+        for band in range(self.owner.bands):
+            weights = fragments.gain[:, band] * arriving[:, band]
+            self.radiance[:, band] += np.bincount(fragments.pixel, weights, len(self.radiance))
+
+    # ---- rays from the eye ----------------------------------------------------------------------
+
+    def _look(self, x: NDArray, y: NDArray, pixel: IntArray, keys: IntArray) -> _Seen:
+        self.counters.add(rays=len(x), cast_rays=len(x))
+        return self.owner.look(self.rays, self.left + x, self.top + y, pixel, keys)
+
+    def _whole_pixels(self, radiance: FloatArray) -> tuple[_Fragments, IntArray]:
+        """Fragments of the pixels whose middle and corners see the same, and the numbers of the others."""
+        number = np.arange(self.height * self.width)
+        row, column = np.divmod(number, self.width)
+        middle = self._look(column + 0.5, row + 0.5, number, self._keys(column, row, 0))
+        across, along = (v.ravel() for v in np.meshgrid(np.arange(self.width + 1), np.arange(self.height + 1)))
+        # Corners stand off whole numbers by a hair: edges of rooms like to lie on them.
+        corner = self._look(across + 1e-4, along + 1e-4, np.arange(len(across)), self._keys(across, along, 0))
+        at = row * (self.width + 1) + column
+        same = np.ones(len(number), dtype=bool)
+        scale = middle.radiance.max(axis=1)
+        for place in (at, at + 1, at + self.width + 1, at + self.width + 2):
+            other = corner.radiance[place]
+            step = np.abs(other - middle.radiance).max(axis=1)
+            same &= (corner.mark[place] == middle.mark) & (step <= STEP * np.maximum(scale, other.max(axis=1)))
+        radiance[same] = middle.radiance[same]
+        return middle.fragments.take(np.flatnonzero(same[middle.fragments.pixel])), np.flatnonzero(~same)
+
+    def _keys(self, column: IntArray, row: IntArray, place: int | IntArray) -> IntArray:
+        """Number of a ray in the whole picture, which its random numbers come from."""
+        return ((row + self.top) * (self.rays.width + 1) + column + self.left) * (1 << 10) + place
+
+    def _divide(
+        self, pixels: IntArray, radiance: FloatArray
+    ) -> tuple[_Fragments, FloatArray, NDArray[np.bool_], IntArray]:
+        """Cast many rays in some pixels: fragments, direct irradiance, whether crowded, and the pixels of its places."""
+        many = len(self.owner._places)
+        row, column = np.divmod(np.repeat(pixels, many), self.width)
+        place = np.tile(np.arange(many), len(pixels))
+        inside = self.owner._places[place]
+        seen = self._look(
+            column + inside[:, 0], row + inside[:, 1], np.repeat(pixels, many), self._keys(column, row, place)
+        )
+        radiance[pixels] = seen.radiance.reshape(len(pixels), many, -1).mean(axis=1)
+        every = seen.fragments
+        bands = self.owner.bands
+        if not len(every):
+            return every, np.zeros((0, bands)), np.zeros(0, dtype=bool), every.pixel
+        # What the rays of a pixel see of one sheet is one fragment.
+        order = np.lexsort((every.sheet, every.pixel))
+        changes = (np.diff(every.sheet[order]) != 0) | (np.diff(every.pixel[order]) != 0)
+        start = np.flatnonzero(np.concatenate([[True], changes]))
+        counts = np.diff(np.append(start, len(order)))
+        group = np.repeat(np.arange(len(start)), counts)
+        # The place nearest to the mean stands for all: the mean itself may lie under something.
+        middle_x, middle_y = (np.bincount(group, v[order]) / counts for v in (every.x, every.y))
+        off = np.hypot(every.x[order] - middle_x[group], every.y[order] - middle_y[group])
+        fragments = every.take(order[np.lexsort((off, group))[start]])
+        gain = every.gain[order]
+        fragments.gain = np.column_stack([np.bincount(group, band) / many for band in gain.T])
+        # Direct light at some places of each fragment, for shadows have edges inside pixels, too:
+        # weighted by gain, which differs where one sheet holds several surfaces.
+        chosen = seen.ray[order] % many < DIRECT_PLACES
+        had = np.bincount(group, chosen) > 0
+        chosen[start[~had]] = True
+        straight = self._direct(every.take(order[chosen]))
+        light = straight.irradiance
+        weight = gain[chosen]
+        total = np.column_stack([np.bincount(group[chosen], w, len(start)) for w in weight.T])
+        sums = np.column_stack([np.bincount(group[chosen], w, len(start)) for w in (weight * light).T])
+        direct = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
+        crowded = np.bincount(group[chosen], straight.crowded, len(start)) > 0
+        return fragments, direct, crowded, every.pixel[order[chosen]]
+
+    # ---- direct light ---------------------------------------------------------------------------
+
+    def _direct(self, fragments: _Fragments) -> Direct:
+        return self.owner.gatherer.direct(
+            fragments.points, fragments.normals, own_polygon=fragments.polygon, error=self.options.error,
+            counters=self.counters,
+        )  # fmt: skip
+
+    def _shadow_edges(self, fragments: _Fragments, direct: FloatArray) -> NDArray[np.bool_]:
+        """Fragments whose direct light steps toward a neighbour's on the same sheet."""
+        cut = np.zeros(len(fragments), dtype=bool)
+        bright = direct.sum(axis=1)
+        place = fragments.sheet * (self.height * self.width) + fragments.pixel
+        order = np.argsort(place, kind="stable")
+        known = place[order]
+        column = fragments.pixel % self.width
+        for inside, onward in ((column + 1 < self.width, 1), (np.ones(len(place), dtype=bool), self.width)):
+            one = np.flatnonzero(inside & (fragments.pixel + onward < self.height * self.width))
+            at = np.minimum(np.searchsorted(known, place[one] + onward), len(known) - 1)
+            met = known[at] == place[one] + onward
+            one, other = one[met], order[at[met]]
+            step = np.abs(bright[one] - bright[other]) > STEP * np.maximum(bright[one], bright[other])
+            cut[one[step]] = cut[other[step]] = True
+        return cut
+
+    # ---- indirect light -------------------------------------------------------------------------
+
+    def _bundles(self, fragments: _Fragments, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What nodes hold (n, 2 bands), its standard error, and harmonic mean distance (n,) of some fragments."""
+        found = self.owner.gatherer.indirect(
+            fragments.points[rows], fragments.normals[rows], rays=self.options.bundle, counters=self.counters
+        )
+        spread = np.concatenate([found.standard_error, found.standard_error], axis=1)
+        return np.concatenate([found.indirect, found.sky], axis=1), spread, found.distance
+
+    def place_nodes(self, nodes: _Nodes) -> None:
+        """Add nodes on ever finer lattices, where the last one's disagree with what was foretold."""
+        fragments, direct = self.light.fragments, self.light.direct
+        if not self.light.asks_nodes(self.options.indirect):
+            return
+        everywhere = _places(fragments)
+        if not self.options.atomic:
+            value, _, _ = self._bundles(fragments, np.arange(len(fragments)))
+            self.samples["indirect"] += np.bincount(fragments.pixel, minlength=len(self.samples["indirect"]))
+            nodes.add(everywhere, value)
+            return
+        margin = 2.0 * self.pitch
+        edges = self.left - margin, self.top - margin, self.left + self.width + margin, self.top + self.height + margin
+        region = np.ones(len(fragments), dtype=bool)
+        pitch, first = self.pitch, True
+        while pitch >= 1 and region.any():
+            cell = _cells(everywhere, pitch)
+            near = nodes.near(*edges)
+            held = np.isin(cell, _cells(near.place, pitch))
+            rows = _nearest_to_middles(fragments, np.flatnonzero(region & ~held), cell, pitch)
+            if len(rows):
+                foretold = near.between(everywhere[rows], self.owner.workers)
+                found, spread, distance = self._bundles(fragments, rows)
+                nodes.add(everywhere[rows], found)
+                self.samples["indirect"] += np.bincount(fragments.pixel[rows], minlength=len(self.samples["indirect"]))
+            if not first:  # the second lattice is sampled everywhere, too: it judges the first
+                region = np.zeros(len(fragments), dtype=bool)
+                if len(rows):
+                    whole = direct[rows] + found[:, : self.owner.bands]
+                    total = np.concatenate([whole, whole + found[:, self.owner.bands :]], axis=1)
+                    off = np.abs(np.where(np.isfinite(foretold), foretold, found) - found) - NOISE * spread
+                    uneven = (off > self.options.error * total).any(axis=1)
+                    close = pitch * fragments.footprint[rows] > SPACING * distance
+                    flagged = cell[rows[uneven | close]]
+                    region = np.isin(cell, (np.unique(flagged)[:, None] + _AROUND).ravel())
+            pitch, first = pitch // 2, False
+
+
+def _places(fragments: _Fragments) -> FloatArray:
+    """Places (n, 3) in the picture, the sheets far apart."""
+    return np.column_stack([fragments.x, fragments.y, fragments.sheet * APART])
+
+
+_ROW = 1 << 20
+_AROUND = np.array([dy * _ROW + dx for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+"""From a cell's number to those of itself and its neighbours."""
+
+
+def _cells(place: FloatArray, pitch: int) -> IntArray:
+    """Number (n,) of each place's cell of a lattice, on its sheet."""
+    column, row = ((place[:, k] / pitch).astype(np.int64) + 1 for k in (0, 1))
+    return (np.rint(place[:, 2] / APART).astype(np.int64) * _ROW + row) * _ROW + column
+
+
+def _nearest_to_middles(fragments: _Fragments, rows: IntArray, cell: IntArray, pitch: int) -> IntArray:
+    """Of the fragments ``rows`` the one in each cell that is nearest to the cell's middle."""
+    off = np.hypot(fragments.x[rows] / pitch % 1.0 - 0.5, fragments.y[rows] / pitch % 1.0 - 0.5)
+    order = rows[np.lexsort((off, cell[rows]))]
+    return order[np.concatenate([[True], np.diff(cell[order]) != 0])] if len(order) else order

@@ -1,0 +1,252 @@
+"""Pictures gathered from solutions: exact truths, failure modes of section 9, and what must not matter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from picture_scenes import camera, furnace, lit_floor, solved, straight_down
+
+from radiosity import gather
+from radiosity._picture_kernels import local_fits
+from radiosity.gather import GatherOptions, Picture, PictureGatherer
+from radiosity.patches import _area_and_centroid, _vector_areas, build_mesh
+from radiosity.regather import _cut, regathered
+from radiosity.sensors import Gatherer
+from workbench.errors import InputError, OptionError
+from workbench.geometry.flat import Geometry
+from workbench.scene.library import box_surface, diffuse
+from workbench.scene.model import Material, Scene, Surface
+
+# light/quad-row and shadow/square/row-a=0.4 of truth.json (Lambert 1760; Baum, Rushmeier and Winget 1989)
+QUAD_ROW = {0.0: 0.23083679773017077, 0.5: 0.207918813257321, 1.0: 0.1555774353085024, 2.0: 0.06370584387198608}
+SQUARE_ROW = {0.0: 0.07891872804788831, 0.25: 0.11013944131305949, 0.5: 0.14985312372514176, 1.0: 0.1555774353085024}
+OCCLUDER = [[-0.2, -0.2, 1], [0.2, -0.2, 1], [0.2, 0.2, 1], [-0.2, 0.2, 1]]
+
+
+def middle_irradiance(gatherer, x):
+    """Irradiance that the middle pixel of a small patch of floor shows, by its radiance rho E / pi."""
+    picture = gatherer.draw(straight_down(x, 0.0, width=1e-3))
+    return picture.radiance[1, 1, 0] * np.pi / 0.5
+
+
+@pytest.mark.parametrize(("occluders", "truth"), [((), QUAD_ROW), ((OCCLUDER,), SQUARE_ROW)])
+def test_without_indirect_light_pixels_show_the_exact_irradiance(occluders, truth):
+    gatherer = PictureGatherer(solved(lit_floor(*occluders)), workers=1)
+    for x, value in truth.items():
+        assert middle_irradiance(gatherer, x) == pytest.approx(value, rel=1e-5), x
+
+
+def test_9_1_a_picture_of_a_corner():
+    # A floor that reflects beside a wall of radiosity 1: Lambert's formula for the wall, 0.5 in the corner.
+    wall = np.array([[0, -1, 0], [0, 1, 0], [0, 1, 1], [0, -1, 1]], float)
+    floor = np.array([[0, -1, 0], [2, -1, 0], [2, 1, 0], [0, 1, 0]], float)
+    scene = Scene(
+        "corner",
+        (
+            Surface.from_polygons("wall", diffuse("wall", 0.0, 1.0), [wall]),
+            Surface.from_polygons("floor", diffuse("floor", 0.5), [floor]),
+        ),
+        background=np.zeros(1),
+        bands=1,
+    )
+    gatherer = PictureGatherer(solved(scene), workers=1)
+    # fail/corner-gather of truth.json
+    found = [
+        gatherer.draw(straight_down(d, 0.0, width=0.2 * d)).radiance[1, 1, 0] * np.pi / 0.5 for d in (0.1, 0.01, 1e-3)
+    ]
+    assert found == pytest.approx([0.44347734173991543, 0.4943172117952321, 0.49943169042449675], rel=1e-3)
+
+
+def lit_room() -> Scene:
+    room = box_surface("room", diffuse("grey", 0.6), (0, 0, 0), (2, 2, 2), inward=True)
+    lamp = np.array([[0.7, 0.7, 1.99], [0.7, 1.3, 1.99], [1.3, 1.3, 1.99], [1.3, 0.7, 1.99]], float)
+    surfaces = (room, Surface.from_polygons("lamp", diffuse("lamp", 0.0, 5.0), [lamp]))
+    return Scene("room", surfaces, background=np.zeros(1), bands=1)
+
+
+def test_9_2_no_steps_one_element_wide():
+    # Along a wall of a lit room the gathered picture is smooth where a coarse mesh has steps.
+    scene = lit_room()
+    coarse = solved(scene, elements=60)
+    picture = PictureGatherer(coarse, GatherOptions(error=0.02), workers=1).draw(
+        camera((1.0, 0.5, 1.0), (1.0, 2.0, 1.0), fov=50, width=18, height=18)
+    )
+    row = picture.radiance[9, :, 0]
+    bend = np.abs(np.diff(row, 2)) / row[1:-1]
+    assert bend.max() < 0.02
+    # What the picture shows there is what a gather with many rays finds.
+    gatherer = Gatherer(coarse, workers=1)
+    step = np.tan(np.radians(25)) * 1.5 * 2 / 18
+    x = 1.0 - (np.arange(18) - 8.5) * step
+    fine = regathered(coarse, gatherer=gatherer, passes=4, error=0.01)
+    exact = fine.irradiance(
+        np.column_stack([x, np.full(18, 2.0), np.full(18, 1.0 - 0.5 * step)]), np.array([0.0, -1.0, 0.0]), rays=4096,
+    ).irradiance[:, 0]  # fmt: skip
+    assert np.sqrt(np.mean((row / (0.6 / np.pi * exact) - 1) ** 2)) < 0.02
+
+
+def test_9_3_the_centre_of_a_face_is_not_its_mean():
+    # rad/cube-continuous of truth.json, black emitter, rho 0.5: opposite face 0.15517 in the mean, 0.17914 in
+    # its centre.
+    grey, lamp = diffuse("grey", 0.5), diffuse("lamp", 0.0, 1.0)
+    walls = box_surface("walls", grey, (0, 0, 0), (1, 1, 1), inward=True, omit=["-z"])
+    floor = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    scene = Scene(
+        "cube", (walls, Surface.from_polygons("lamp", lamp, [floor])), background=np.zeros(1), bands=1, closed=True
+    )
+    gatherer = PictureGatherer(solved(scene, elements=150), GatherOptions(error=0.01), workers=1)
+    view = camera((0.5, 0.5, 0.5), (0.5, 0.5, 1), up=(0, 1, 0), fov=1.0, width=3, height=3)
+    radiosity = gatherer.draw(view).radiance[1, 1, 0] * np.pi
+    assert radiosity == pytest.approx(0.17914195, rel=0.005)
+
+
+def test_9_4_direct_light_is_not_counted_twice():
+    # Beside a second, reflecting floor far away nothing changes: light/quad-row at x = 0 holds E, not 2 E.
+    gatherer = PictureGatherer(solved(lit_floor()), GatherOptions(error=0.02), workers=1)
+    both = middle_irradiance(gatherer, 0.0)
+    alone = PictureGatherer(solved(lit_floor()), GatherOptions(indirect=False), workers=1)
+    assert both == pytest.approx(middle_irradiance(alone, 0.0), rel=1e-9)
+    assert both == pytest.approx(QUAD_ROW[0.0], rel=1e-5)
+
+
+def test_9_5_what_walls_send_is_what_they_are_seen_to_send():
+    # Energy: from inside a closed furnace every pixel shows e / (1 - rho), so absorbed equals emitted.
+    gatherer = PictureGatherer(solved(furnace(0.8)), GatherOptions(error=0.05), workers=1)
+    radiance = gatherer.draw(camera((0.2, 0.3, 0.9), (2.0, 1.4, 0.8), fov=70, width=12, height=12)).radiance
+    absorbed = (1 - 0.8) / 0.8 * (radiance * np.pi - 1.0)
+    assert absorbed == pytest.approx(1.0, rel=5e-3)
+
+
+@pytest.mark.parametrize("reflectance", [0.5, 0.9])
+def test_furnace_pictures_are_constant(reflectance):
+    gatherer = PictureGatherer(solved(furnace(reflectance), tolerance=1e-5), GatherOptions(error=0.02), workers=1)
+    radiance = gatherer.draw(camera((0.2, 0.3, 0.9), (2.0, 1.4, 0.8), fov=70, width=12, height=12)).radiance * np.pi
+    assert radiance == pytest.approx(1 / (1 - reflectance), rel=1e-3)  # 1 / (1 - rho)
+
+
+def test_atomic_sampling_changes_little_and_saves_bundles():
+    solution = solved(lit_room())
+    view = camera((1.0, 0.5, 1.0), (1.0, 2.0, 1.0), fov=50, width=19, height=19)
+    pictures = [
+        PictureGatherer(solution, GatherOptions(error=0.05, atomic=atomic), workers=1).draw(view)
+        for atomic in (True, False)
+    ]
+    some, every = (picture.samples["indirect"].sum() for picture in pictures)
+    assert some < 0.6 * every
+    off = pictures[0].radiance / pictures[1].radiance - 1
+    assert np.sqrt((off**2).mean()) < 0.03
+
+
+def test_a_mirror_shows_what_stands_before_it():
+    # A wall seen in a perfect mirror (share 0.8) shows 0.8 of what it shows directly from the mirrored eye.
+    zero = np.zeros(1)
+    mirror = Material("mirror", zero, zero, np.array([0.8]), np.inf, zero)
+    glass = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], float)
+    wall = np.array([[0, 0, 2], [0, 2, 2], [2, 2, 2], [2, 0, 2]], float)
+    lamp = np.array([[0, 0, 0.5], [0, 0, 1.5], [0, 2, 1.5], [0, 2, 0.5]], float)[::-1]
+    scene = Scene(
+        "mirror",
+        (
+            Surface.from_polygons("mirror", mirror, [glass]),
+            Surface.from_polygons("wall", diffuse("wall", 0.7), [wall]),
+            Surface.from_polygons("lamp", diffuse("lamp", 0.0, 1.0), [lamp]),
+        ),
+        background=np.zeros(1),
+        bands=1,
+    )
+    gatherer = PictureGatherer(solved(scene), GatherOptions(error=0.05), workers=1)
+    seen = gatherer.draw(camera((1.5, 0.8, 1.0), (1.3, 1.0, 0), up=(0, 1, 0), fov=20, width=5, height=5)).radiance
+    direct = gatherer.draw(camera((1.5, 0.8, -1.0), (1.3, 1.0, 0), up=(0, 1, 0), fov=20, width=5, height=5)).radiance
+    assert direct.min() > 0
+    assert seen[:, ::-1] == pytest.approx(0.8 * direct, rel=3e-2)
+
+
+def test_neither_workers_nor_tiles_matter(monkeypatch):
+    solution = solved(lit_floor(OCCLUDER, bands=3))
+    view = camera((0, -3, 1.5), (0, 0, 0.2), width=17, height=13)
+    one, two = (PictureGatherer(solution, GatherOptions(error=0.05), workers=n).draw(view).radiance for n in (1, 2))
+    np.testing.assert_array_equal(one, two)
+    monkeypatch.setattr(gather, "TILE", 8)
+    monkeypatch.setattr(gather, "TILES_IN_MEMORY", 1)
+    tiled = PictureGatherer(solution, GatherOptions(error=0.05), workers=1).draw(view)
+    assert len(tiled.tiles) == 6 and tiled.finished == set(range(6))
+    np.testing.assert_allclose(tiled.radiance, one, rtol=0.2, atol=0.02 * one.max())
+    assert np.sqrt(((tiled.radiance - one) ** 2).mean()) < 0.01 * one.mean()
+
+
+def test_a_picture_left_half_way_goes_on_from_its_state(monkeypatch):
+    monkeypatch.setattr(gather, "TILE", 8)
+    gatherer = PictureGatherer(solved(furnace(0.5)), GatherOptions(error=0.1), workers=1)
+    view = camera((0.2, 0.3, 0.9), (2.0, 1.4, 0.8), fov=70)
+    first = Picture(gatherer, view)
+    steps = first.steps()
+    next(steps)
+    steps.close()
+    assert first.radiance[:8, :8].min() > 0 and not first.radiance[8:, 8:].any()
+    second = Picture(gatherer, view)
+    second.resume(first.state())
+    for _ in second.steps():
+        pass
+    assert second.finished == set(range(4))
+    whole = gatherer.draw(view)
+    np.testing.assert_allclose(second.radiance, whole.radiance, rtol=1e-3)
+    with pytest.raises(InputError, match="resume"):
+        Picture(gatherer, camera((0.2, 0.3, 0.9), (2.0, 1.4, 0.8), width=5, height=5)).resume(first.state())
+
+
+def test_states_and_samples_are_those_of_woo():
+    picture = PictureGatherer(solved(lit_floor(OCCLUDER)), GatherOptions(error=0.02), workers=1).draw(
+        straight_down(0.0, 0.0, height=0.9, width=3.0, pixels=15)
+    )
+    states = picture.states[..., 0]
+    # penumbra: |x| < 0.9 by similar triangles (light 0.5 at 2, occluder 0.2 at 1); no umbra
+    assert (states[:2] == 0).all() and states[7, 7] == 2
+    assert (picture.samples["camera"] >= 2).all() and (picture.samples["direct"] >= 1).all()
+
+
+@pytest.mark.parametrize(("key", "value"), [("error", 0.0), ("error", 1.0), ("rays", 0)])
+def test_options_out_of_range_are_refused(key, value):
+    with pytest.raises(OptionError, match=key):
+        GatherOptions(**{key: value})
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_local_fits_meet_planes_exactly_enough(seed):
+    rng = np.random.default_rng(seed)
+    samples = rng.uniform(0, 10, (12, 2))
+    slope, place = rng.uniform(-1, 1, 2), rng.uniform(3, 7, (4, 2))
+    values = 30 + samples @ slope
+    distance = np.linalg.norm(place[:, None] - samples, axis=2)
+    order = np.argsort(distance, axis=1)[:, :10]
+    out = np.empty((4, 1))
+    local_fits(place, order, np.take_along_axis(distance, order, axis=1), 1e6, samples, values[:, None], out)
+    spread = np.ptp(values[order], axis=1)
+    assert (np.abs(out[:, 0] - (30 + place @ slope)) <= 0.1 * spread + 1e-9).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=15, deadline=None)
+def test_cut_elements_tile_what_they_cut(seed):
+    rng = np.random.default_rng(seed)
+    outer = np.array([[0, 0, 0], [3, 0, 0], [3, 2, 0], [0, 2, 0]], float)
+    hole = np.array([[1, 0.5, 0], [1, 1.2, 0], [1.9, 1.2, 0], [1.9, 0.5, 0]], float)
+    tri = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1.0]])
+    grey = replace(diffuse("grey", 0.5), two_sided=True)
+    surfaces = (Surface.from_polygons("plate", grey, [[outer, hole]]), Surface.from_polygons("tri", grey, [tri]))
+    scene = Scene("plate", surfaces, background=np.zeros(1), bands=1)
+    mesh = build_mesh(scene, Geometry.from_scene(scene), elements=int(rng.integers(1, 40)))
+    for _ in range(2):
+        finer, parent = _cut(mesh, rng.random(mesh.element_count) < 0.5)
+        area, centroid = _area_and_centroid(finer.corners, finer.piece_start, finer.piece_element, finer.element_count)
+        np.testing.assert_allclose(area, finer.element_area, rtol=1e-9)
+        np.testing.assert_allclose(centroid, finer.element_centroid, atol=1e-12)
+        np.testing.assert_allclose(np.bincount(parent, area, mesh.element_count), mesh.element_area, rtol=1e-6)
+        turn = _vector_areas(finer.corners, finer.piece_start)
+        assert (np.einsum("ij,ij->i", turn, finer.piece_normal) > 0).all()
+        assert (np.diff(finer.element_patch) >= 0).all()
+        mesh = finer
