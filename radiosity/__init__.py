@@ -2,7 +2,7 @@
 
 >>> import workbench, radiosity
 >>> scene = workbench.load("cornell-box")                    # doctest: +SKIP
->>> solution = radiosity.solve(scene, elements=2000)         # doctest: +SKIP
+>>> solution = radiosity.solve(scene, error=0.01)         # doctest: +SKIP
 >>> solution.save("out/cornell")                             # doctest: +SKIP
 
 The public names are imported when they are first used, so that ``import radiosity`` costs nothing.
@@ -14,10 +14,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from radiosity.accuracy import solve
     from radiosity.patches import PatchMesh
     from radiosity.sensors import Gatherer, IrradianceEstimate
     from radiosity.solvers.solution import ProgressEvent, Solution
-    from radiosity.solvers.solve import solve
     from radiosity.view import render_preview
 
 __all__ = ["Gatherer", "IrradianceEstimate", "PatchMesh", "ProgressEvent", "Solution", "render_preview", "solve"]
@@ -29,7 +29,7 @@ _HOME = {
     "ProgressEvent": "radiosity.solvers.solution",
     "Solution": "radiosity.solvers.solution",
     "render_preview": "radiosity.view",
-    "solve": "radiosity.solvers.solve",
+    "solve": "radiosity.accuracy",
 }
 
 

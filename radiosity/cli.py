@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from radiosity.chart_command import chart
+from radiosity.irradiance_command import irradiance
 from radiosity.render_command import render
 from radiosity.reproduce import REPRODUCTIONS
 from radiosity.shadow_command import shadow
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 BAD_INPUT = 2
+_GIVEN = click.core.ParameterSource.COMMANDLINE
 INTERRUPTED = 130
 
 
@@ -113,6 +115,20 @@ def main() -> None:
 @click.option(
     "--method", type=click.Choice(["auto", "progressive", "direct"]), default="auto", show_default=True, help="Solver."
 )
+@click.option(
+    "--error",
+    type=click.FloatRange(min=0, max=1, min_open=True, max_open=True),
+    callback=_finite,
+    metavar="E",
+    help="Refine until the error of the irradiance (RMS over the surfaces / mean) is below E.",
+)
+@click.option(
+    "--budget-seconds",
+    type=click.FloatRange(min=0, min_open=True),
+    callback=_finite,
+    metavar="S",
+    help="Do the best that fits into S seconds and say the error reached.",
+)
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Threads.  [default: all cores]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of the rays.")
 @click.option("--json", "json_path", metavar="FILE", help="Write the run's record here too; - is standard output.")
@@ -126,6 +142,8 @@ def solve(
     rays: int,
     tolerance: float,
     method: str,
+    error: float | None,
+    budget_seconds: float | None,
     workers: int | None,
     seed: int,
     json_path: str | None,
@@ -141,6 +159,9 @@ def solve(
     """
     if elements is not None and max_edge is not None:
         raise OptionError("--elements and --max-edge: found both, expected one; leave one out")
+    knob = error is not None or budget_seconds is not None
+    if knob and click.get_current_context().get_parameter_source("tolerance") is _GIVEN:
+        raise OptionError("--tolerance and --error: found both, expected one; the error decides the tolerance")
     import workbench
 
     start = time.perf_counter()
@@ -161,12 +182,16 @@ def solve(
             "max_edge": max_edge,
             "rays": rays,
             "tolerance": tolerance,
+            "error": error,
+            "budget_seconds": budget_seconds,
             "seed": seed,
         }
         previous = None
         if resume:
             previous = radiosity.Solution.load(directory)
             options |= _asked_before(previous.record.settings, options)
+        if options["error"] is not None or options["budget_seconds"] is not None:
+            del options["tolerance"]
         with _progress() as report:
             solution = radiosity.solve(
                 loaded,
@@ -189,7 +214,7 @@ def solve(
 def _asked_before(settings: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
     """The options of the earlier run that this command line leaves open."""
     context = click.get_current_context()
-    given = {name for name in options if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE}
+    given = {name for name in options if context.get_parameter_source(name) is _GIVEN}
     if given & {"elements", "max_edge"}:  # one of the two stands for both
         given |= {"elements", "max_edge"}
     return {name: settings[name] for name in options if name not in given and name in settings}
@@ -331,6 +356,7 @@ def _share_done(first: float | None, residual: float, tolerance: float) -> float
 
 
 _ERRORS = {
+    "estimate": "error of the irradiance, RMS over the surfaces / mean",
     "remaining_bound": "light still missing, at most this share",
     "energy_imbalance": "energy book off by",
     "row_sum": "row sums of form factors",
@@ -349,7 +375,11 @@ def _summary(solution: Solution, files: list[Path]) -> str:
         f"{record.counters['shots']} shots, {record.counters['rays']} rays"
     ]
     lines.append("seconds: " + "; ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()))
-    lines += [f"{_ERRORS.get(name, name.replace('_', ' '))}: {_short(value)}" for name, value in record.errors.items()]
+    lines += [
+        f"{_ERRORS.get(name, name.replace('_', ' '))}: {_short(value)}"
+        for name, value in record.errors.items()
+        if name != "definition"
+    ]
     lines += [f"{path}" for path in files]
     return "\n".join(lines)
 
@@ -394,6 +424,7 @@ def reproduce(name: str, directory: Path | None, quick: bool) -> None:
 
 main.add_command(render)
 main.add_command(shadow)
+main.add_command(irradiance)
 main.add_command(chart)
 
 

@@ -509,7 +509,7 @@ class _Tile:
     def _divide(
         self, pixels: IntArray, radiance: FloatArray
     ) -> tuple[_Fragments, FloatArray, NDArray[np.bool_], IntArray]:
-        """Cast many rays in some pixels: fragments, direct irradiance, whether crowded, and the pixels of its places."""
+        """Cast many rays in some pixels: fragments, their direct light, if crowded, and pixels of its places."""
         many = len(self.owner._places)
         row, column = np.divmod(np.repeat(pixels, many), self.width)
         place = np.tile(np.arange(many), len(pixels))

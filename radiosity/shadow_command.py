@@ -5,8 +5,6 @@ Only ``click`` is imported at the top; everything heavy is imported when the com
 
 from __future__ import annotations
 
-import csv
-import math
 import os
 import re
 from dataclasses import dataclass
@@ -219,7 +217,7 @@ class Sensors:
 
 
 def read_points(path: Path) -> Sensors:
-    """Points and normals from a file of six numbers a line; a first line of names is skipped.
+    """Points and normals from a file, see :func:`radiosity.points_file.read_sensor_points`.
 
     Raises
     ------
@@ -228,27 +226,9 @@ def read_points(path: Path) -> Sensors:
     """
     import numpy as np
 
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as problem:
-        reason = getattr(problem, "strerror", None) or "not a text file"
-        raise InputError(f"{path}: cannot be read: {reason}; expected lines of x,y,z,nx,ny,nz") from None
-    rows: list[list[float]] = []
-    for number, cells in enumerate(csv.reader(text.splitlines()), 1):
-        if not cells or (number == 1 and re.fullmatch(r"\s*[A-Za-z_]\w*\s*", cells[0])):
-            continue
-        try:
-            row = [float(cell) for cell in cells]
-        except ValueError:
-            row = []
-        if len(row) != 6 or not all(map(math.isfinite, row)):
-            raise InputError(f"{path}: line {number}: found {','.join(cells)!r}, expected six numbers x,y,z,nx,ny,nz")
-        if not any(row[3:]):
-            raise InputError(f"{path}: line {number}: found a normal of length zero, expected a direction")
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{path}: found no points, expected lines of x,y,z,nx,ny,nz")
-    table = np.asarray(rows)
+    from radiosity.points_file import read_sensor_points
+
+    table = read_sensor_points(path)
     spread = np.ptp(table[:, :3], axis=0)
     first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
     return Sensors(

@@ -15,6 +15,7 @@ with the receiver bundles of Wallace, Elmquist and Haines (1989).  Three departu
 
 from __future__ import annotations
 
+import math
 import time
 
 import numpy as np
@@ -163,7 +164,8 @@ def shoot_until(
     now and then; gone on from there, or from the interruption, the answer is the same, bit for bit.
     """
     mesh, record = solution.mesh, solution.record
-    start = saved = time.perf_counter()
+    start = time.perf_counter()
+    saved = -math.inf  # the first at once: from then on a solve that is killed can go on
     pause = CHECKPOINT_SECONDS
     if solution.shooting is None:
         solution.shooting = ShootingState.empty(mesh.patch_count, mesh.bands)

@@ -118,8 +118,8 @@ class ShootingState:
 
     def copy(self) -> ShootingState:
         """An independent copy; the kept form factors, which never change, are shared."""
-        arrays = (self.floor, self.row_sum, self.doubt, self.mean_square, self.sent)
-        return ShootingState(*(array.copy() for array in arrays), dict(self.kept))
+        arrays = {name: getattr(self, name).copy() for name in _SHOOTING_ARRAYS}
+        return ShootingState(**arrays, kept=dict(self.kept))
 
     def as_arrays(self, *, with_kept: bool) -> dict[str, NDArray]:
         """Arrays by name, for a file."""
@@ -132,7 +132,7 @@ class ShootingState:
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray]) -> ShootingState:
         """The inverse of :meth:`as_arrays`."""
-        state = cls(*(arrays[name] for name in _SHOOTING_ARRAYS))
+        state = cls(**{name: arrays[name] for name in _SHOOTING_ARRAYS}, kept={})
         if "kept_patches" in arrays:
             state.kept = dict(zip(arrays["kept_patches"].tolist(), arrays["kept_factors"], strict=True))
         return state

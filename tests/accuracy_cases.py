@@ -1,0 +1,98 @@
+"""Scenes with a known irradiance, on which the accuracy knob is judged: asked, estimated, actual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from radiosity_scenes import cube_with_emitter, truths
+
+from radiosity.accuracy import surface_points
+from radiosity.solvers.solution import Solution
+from workbench.scene.library import unit_cube
+from workbench.scene.model import Scene
+
+POINTS = 200
+
+
+@dataclass(frozen=True)
+class AccuracyCase:
+    """A scene, the options of its solve, and the actual error of a solution, RMS over mean."""
+
+    name: str
+    scene: Scene
+    actual: Callable[[Solution], float]
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def _relative_rms(found, wanted, weight=None) -> float:
+    weight = np.ones(len(wanted)) if weight is None else weight
+    square = weight @ (np.asarray(found) - wanted) ** 2 / weight.sum()
+    return float(np.sqrt(square) / (weight @ wanted / weight.sum()))
+
+
+def _at_points(solution: Solution, wanted: float) -> float:
+    """Against one irradiance everywhere."""
+    points, normals, polygon = surface_points(solution.mesh, POINTS, seed=7)
+    error = solution.record.errors["estimate"]["total"]
+    found = solution.irradiance_at(points, normals, own_polygon=polygon, error=min(max(error, 1e-4), 0.1)).irradiance
+    return _relative_rms(found[:, 0], np.full(POINTS, wanted))
+
+
+def _furnace(rho: float) -> AccuracyCase:
+    # Everything sends 1 / (1 - rho), so that is what arrives: substitution.
+    wanted = 1.0 / (1.0 - rho)
+    return AccuracyCase(f"rad/furnace/rho={rho:g}", unit_cube(rho, 1.0), lambda s: _at_points(s, wanted))
+
+
+def _six_faces(name: str, case: dict) -> AccuracyCase:
+    """One element a face: the truth is the solution of the 6 x 6 system."""
+    rho_emitter, rho = case["geometry"]["rho_emitter"], case["geometry"]["rho_others"]
+    emitter, opposite, side = case["value"][:3]
+
+    def actual(solution: Solution) -> float:
+        height = np.round(2 * solution.mesh.element_centroid[:, 2]).astype(int)
+        wanted = np.choose(height, [0.0, side / rho, opposite / rho])
+        known = np.ones(6, dtype=bool)
+        if rho_emitter > 0:
+            wanted[height == 0] = (emitter - 1.0) / rho_emitter
+        else:
+            known = height > 0  # what a black face sends says nothing of what it receives
+        return _relative_rms(solution.irradiance[known, 0], wanted[known])
+
+    return AccuracyCase(name, cube_with_emitter(rho_emitter, rho), actual, {"elements": 1})
+
+
+def _continuous(name: str, case: dict) -> AccuracyCase:
+    """The mean of each face, and the centre of the one opposite the emitter."""
+    rho_emitter, rho = case["geometry"]["rho_emitter"], case["geometry"]["rho_others"]
+    emitter, opposite, side, centre = case["value"]
+
+    def actual(solution: Solution) -> float:
+        mesh = solution.mesh
+        height = mesh.element_centroid[:, 2]
+        parts = [height == 1, (height > 0) & (height < 1)]
+        wanted = [opposite / rho, side / rho]
+        if rho_emitter > 0:
+            parts.append(height == 0)
+            wanted.append((emitter - 1.0) / rho_emitter)
+        area = np.array([mesh.element_area[part].sum() for part in parts])
+        found = [mesh.element_area[p] @ solution.irradiance[p, 0] / a for p, a in zip(parts, area, strict=True)]
+        means = _relative_rms(np.array(found), np.array(wanted), area)
+        here = solution.irradiance_at([[0.5, 0.5, 1.0]], [[0, 0, -1.0]], rays=65536).irradiance[0, 0]
+        return max(means, abs(here - centre / rho) * rho / side)
+
+    return AccuracyCase(name, cube_with_emitter(rho_emitter, rho), actual)
+
+
+def accuracy_cases() -> list[AccuracyCase]:
+    """All cases; those of the shared truths only where these are present."""
+    cases = [_furnace(rho) for rho in (0.0, 0.8, 0.9, 0.99, 0.999)]
+    for name, case in truths().items():
+        if name.startswith("rad/cube-uniform/"):
+            cases.append(_six_faces(name, case))
+        elif name.startswith("rad/cube-continuous/"):
+            cases.append(_continuous(name, case))
+    return cases

@@ -1,0 +1,120 @@
+"""The accuracy knob: what is asked, what is estimated, and what the error really is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from accuracy_cases import accuracy_cases
+from radiosity_scenes import cube_with_emitter
+
+import radiosity
+from radiosity.accuracy import surface_points
+from workbench.errors import OptionError
+from workbench.scene.library import unit_cube
+
+CASES = {case.name: case for case in accuracy_cases()}
+NEGLIGIBLE = 0.01
+"""Share of the asked error below which estimate and error are both as good as nothing."""
+
+
+@pytest.mark.parametrize("error", [0.05, 0.01])
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_error_lies_below_what_was_asked_and_the_estimate_near_it(name, error):
+    case = CASES[name]
+    solution = radiosity.solve(case.scene, error=error, **case.options)
+    estimate, actual = solution.record.errors["estimate"]["total"], case.actual(solution)
+    assert solution.record.results["target_reached"] and solution.converged
+    assert actual < error
+    both_small = max(actual, estimate) < NEGLIGIBLE * error
+    assert both_small or estimate / 3.5 < actual < 3.5 * estimate
+
+
+def test_a_smaller_error_needs_a_finer_mesh():
+    counts = [radiosity.solve(cube_with_emitter(0.5, 0.5), error=e).mesh.element_count for e in (0.1, 0.01)]
+    assert counts[0] < counts[1]
+
+
+def test_parts_add_up_and_levels_tell_the_story():
+    record = radiosity.solve(cube_with_emitter(0.5, 0.5), error=0.02).record
+    estimate = record.errors["estimate"]
+    parts = ("meshing", "form_factors", "visibility", "convergence")
+    assert estimate["total"] == pytest.approx(sum(estimate[name] for name in parts), rel=1e-12)
+    levels = record.results["levels"]
+    assert levels[0]["difference"] is None and math.isinf(levels[0]["total"])
+    assert [level["elements"] for level in levels] == sorted({level["elements"] for level in levels})
+    assert levels[-1]["total"] == estimate["total"] <= 0.02
+    assert record.settings["error"] == 0.02 and "below the target" in record.choices["stop"]
+
+
+def test_budget_ends_the_refinement_and_says_what_was_reached():
+    solution = radiosity.solve(cube_with_emitter(0.5, 0.5), budget_seconds=0.5)
+    assert solution.converged and "time" in solution.record.choices["stop"]
+    total = solution.record.errors["estimate"]["total"]
+    assert math.isinf(total) or 0 < total < 1
+    both = radiosity.solve(cube_with_emitter(0.5, 0.5), error=1e-6, budget_seconds=0.5)
+    assert not both.converged and not both.record.results["target_reached"]
+
+
+def test_a_given_mesh_is_kept():
+    solution = radiosity.solve(cube_with_emitter(0.5, 0.5), error=1e-3, max_edge=0.25)
+    assert solution.mesh.element_count == 96
+    assert solution.record.errors["estimate"]["meshing"] == 0.0
+    assert solution.record.errors["estimate"]["total"] <= 1e-3
+    fine = radiosity.solve(cube_with_emitter(0.5, 0.5), max_edge=0.25, method="direct", form_factor_error=1e-8)
+    off = (solution.irradiance - fine.irradiance) / fine.irradiance.mean()
+    assert np.sqrt((off**2).mean()) < 1e-3
+
+
+def test_an_interrupted_refinement_leaves_the_last_whole_mesh_and_goes_on_to_the_same(tmp_path):
+    scene = cube_with_emitter(0.5, 0.5)
+    options = {"error": 0.01, "workers": 1, "method": "progressive"}
+    whole = radiosity.solve(scene, **options)
+
+    class KilledError(Exception):
+        pass
+
+    def die_in_the_second_mesh(unfinished):
+        unfinished.save_state(tmp_path)
+        if len(unfinished.record.results["levels"]) == 1:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        radiosity.solve(scene, **options, checkpoint=die_in_the_second_mesh)
+    resumed = radiosity.solve(scene, **options, resume=radiosity.Solution.load(tmp_path))
+    assert (resumed.radiosity == whole.radiosity).all()
+    assert resumed.record.errors["estimate"] == whole.record.errors["estimate"]
+
+    def stop_in_the_second_mesh(event):
+        if event.message.startswith("mesh 2"):
+            raise KeyboardInterrupt
+
+    part = radiosity.solve(scene, **options, progress=stop_in_the_second_mesh)
+    assert part.stopped == "interrupted" and not part.converged
+    assert part.mesh.element_count == whole.record.results["levels"][0]["elements"]
+    assert (part.irradiance > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"error": 0.0}, "error: found 0.0"),
+        ({"error": 2.0}, "error: found 2.0"),
+        ({"budget_seconds": -1.0}, "budget_seconds: found -1.0"),
+        ({"budget_seconds": math.nan}, "budget_seconds: found nan"),
+        ({"error": 0.1, "tolerance": 0.1}, "tolerance and error were both given"),
+    ],
+)
+def test_bad_options(options, words):
+    with pytest.raises(OptionError, match=words):
+        radiosity.solve(unit_cube(0.5, 1.0), **options)
+
+
+def test_surface_points_lie_on_the_surfaces_equally_many_an_area():
+    mesh = radiosity.solve(cube_with_emitter(0.5, 0.5), elements=54).mesh
+    points, normals, polygon = surface_points(mesh, 600, seed=3)
+    on = np.isclose(np.abs(points - 0.5).max(axis=1), 0.5)
+    assert on.all() and (np.einsum("ij,ij->i", points - 0.5, normals) < 0).all()
+    # A sixth on each face, to the one point that stratification leaves open at either end.
+    assert (np.abs(np.bincount(polygon) - 100) <= 2).all()
