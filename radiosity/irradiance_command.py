@@ -25,8 +25,10 @@ __all__ = ["irradiance"]
 
 CHUNK = 65_536
 """Points gathered at once: memory stays bounded however many there are."""
-SOLVE_SHARE = 0.2
-"""Share of the wanted error for light that the solve has not shot."""
+SHARE = 0.7
+"""Share of the wanted error for the solve, and for sampling: the two are independent."""
+UNSHOT_SHARE = 0.2
+"""Share of it for light that a solve of given elements has not shot."""
 
 
 @click.command()
@@ -77,8 +79,8 @@ def irradiance(
     is gathered from the solution.
 
     OUT.csv repeats the points and adds, for each band, irradiance, its direct and indirect part and its
-    standard error, in W/m2.  The standard error is what sampling leaves; the solution's own error is in
-    its record.
+    standard error, in W/m2.  The standard error is what sampling leaves; the solution's own error is
+    printed, and stands in the record.
     """
     import workbench
     from radiosity.points_file import read_sensor_points
@@ -145,14 +147,14 @@ def _solution(
         record.choices["solution"] = f"from {directory}"
     else:
         with record.stage("solve"):
-            solution = radiosity.solve(
-                scene, elements=elements, tolerance=min(0.01, SOLVE_SHARE * error), workers=workers, seed=seed
-            )
+            if elements is None:
+                solution = radiosity.solve(scene, error=SHARE * error, workers=workers, seed=seed)
+            else:
+                tolerance = min(0.01, UNSHOT_SHARE * error)
+                solution = radiosity.solve(scene, elements=elements, tolerance=tolerance, workers=workers, seed=seed)
         record.counters.merge(solution.record.counters)
         record.choices["solution"] = f"solved with {solution.mesh.element_count} elements"
-    record.errors["solution"] = {
-        name: value for name, value in solution.record.errors.items() if isinstance(value, (int, float))
-    }
+    record.errors["solution"] = solution.record.errors
     return solution
 
 
@@ -175,7 +177,7 @@ def _gather(
     with record.stage("gather"), tqdm(total=len(rows), unit="points", disable=None, leave=False) as bar:
         for first in range(0, len(rows), CHUNK):
             some = rows[first : first + CHUNK]
-            parts.append(gatherer.irradiance(some[:, :3], some[:, 3:], error=error))
+            parts.append(gatherer.irradiance(some[:, :3], some[:, 3:], error=SHARE * error))
             record.counters.merge(parts[-1].counters)
             bar.update(len(some))
     record.choices["gather"] = ", ".join(sorted({part.method for part in parts}))
@@ -232,9 +234,12 @@ def _summary(
     record.errors["standard_error_rms_of_mean"] = share
     lines = [
         f"{len(rows)} points: mean irradiance {', '.join(f'{value:.4g}' for value in mean)} W/m2, "
-        f"standard error {share:.2g} of it ({record.choices['gather']})",
+        f"standard error {share:.2g} of it by sampling ({record.choices['gather']})",
         "seconds: " + "; ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()),
     ]
+    estimate = record.errors["solution"].get("estimate")
+    if estimate is not None:
+        lines.insert(1, f"error of the solution: {estimate['total']:.2g} of the mean irradiance over all surfaces")
     if dark:
         lines.append(f"{dark} points receive nothing: behind or inside a surface, or turned away from all light")
     if out_path != "-":

@@ -22,6 +22,7 @@ SHARED = Path(__file__).resolve().parents[2] / ".." / "shared"
 NAMES = [
     "cornell-box",
     "cornell-box-closed",
+    "daylight-office",
     "furnace",
     "hinged-blocker",
     "l-room",
