@@ -15,12 +15,23 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from radiosity.accuracy import solve
+    from radiosity.form_factors.matrix import ViewFactors, view_factors
     from radiosity.patches import PatchMesh
     from radiosity.sensors import Gatherer, IrradianceEstimate
     from radiosity.solvers.solution import ProgressEvent, Solution
     from radiosity.view import render_preview
 
-__all__ = ["Gatherer", "IrradianceEstimate", "PatchMesh", "ProgressEvent", "Solution", "render_preview", "solve"]
+__all__ = [
+    "Gatherer",
+    "IrradianceEstimate",
+    "PatchMesh",
+    "ProgressEvent",
+    "Solution",
+    "ViewFactors",
+    "render_preview",
+    "solve",
+    "view_factors",
+]
 
 _HOME = {
     "Gatherer": "radiosity.sensors",
@@ -28,8 +39,10 @@ _HOME = {
     "PatchMesh": "radiosity.patches",
     "ProgressEvent": "radiosity.solvers.solution",
     "Solution": "radiosity.solvers.solution",
+    "ViewFactors": "radiosity.form_factors.matrix",
     "render_preview": "radiosity.view",
     "solve": "radiosity.accuracy",
+    "view_factors": "radiosity.form_factors.matrix",
 }
 
 

@@ -26,6 +26,7 @@ from radiosity.irradiance_command import irradiance
 from radiosity.render_command import render
 from radiosity.reproduce import REPRODUCTIONS
 from radiosity.shadow_command import shadow
+from radiosity.viewfactors_command import viewfactors
 from workbench.errors import InputError, OptionError, WorkbenchError
 
 if TYPE_CHECKING:
@@ -426,6 +427,7 @@ main.add_command(render)
 main.add_command(shadow)
 main.add_command(irradiance)
 main.add_command(chart)
+main.add_command(viewfactors)
 
 
 # ---- view, scenes, doctor ---------------------------------------------------------------------

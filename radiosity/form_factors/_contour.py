@@ -68,6 +68,7 @@ _GK_G = np.array(
 )
 
 _DEPTH = 60
+CONTOUR_ROWS = _DEPTH + 2
 
 _FAR_ROUNDING = 4e-16
 _NEAR_ROUNDING = 1e-15
@@ -132,6 +133,12 @@ def contour_integral(p, np_, q, nq, tolerance):
 
     ``p[:np_]`` and ``q[:nq]`` are corners; ``tolerance`` is absolute, on the result.
     """
+    return contour_integral_in(p, np_, q, nq, tolerance, np.empty((CONTOUR_ROWS, 3)))
+
+
+@njit(nogil=True, cache=True)
+def contour_integral_in(p, np_, q, nq, tolerance, stack):
+    """:func:`contour_integral` with its scratch, (:data:`CONTOUR_ROWS`, 3)."""
     # r0: distance of the centroids; it only has to be of the right size.
     mx = my = mz = 0.0
     for i in range(np_):
@@ -147,7 +154,6 @@ def contour_integral(p, np_, q, nq, tolerance):
         square0 = 1.0
     log_r0 = 0.5 * math.log(square0)
     share = 2.0 * math.pi * tolerance / (np_ * nq)
-    stack = np.empty((_DEPTH + 2, 3))
     total = rounding = 0.0
     for i in range(np_):
         a = p[i]

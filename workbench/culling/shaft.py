@@ -23,6 +23,12 @@ MAX_SHAFT_PLANES = 6 + 12 + 2
 @njit(nogil=True, cache=True)
 def box_shaft(alow, ahigh, blow, bhigh, planes):
     """Planes (nx, ny, nz, d), inside ``n . x >= d``, of the shaft between two boxes; their number."""
+    return box_shaft_in(alow, ahigh, blow, bhigh, planes, np.empty((8, 2)))
+
+
+@njit(nogil=True, cache=True)
+def box_shaft_in(alow, ahigh, blow, bhigh, planes, corner):
+    """:func:`box_shaft` with its scratch, (8, 2)."""
     used = 0
     size = 0.0
     for axis in range(3):
@@ -34,7 +40,6 @@ def box_shaft(alow, ahigh, blow, bhigh, planes):
         planes[used, axis], planes[used, 3] = 1.0, lo
         planes[used + 1, axis], planes[used + 1, 3] = -1.0, -hi
         used += 2
-    corner = np.empty((8, 2))
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         for c in range(4):

@@ -1,0 +1,835 @@
+"""Exchange areas between all pairs of convex pieces, as kernels: the tree of pairs and its leaves.
+
+A stripe of receivers goes down the tree of pieces once.  At each pair of nodes facing and horizon, the
+sides of the occluders' planes, a shaft and the crossings of an occluder's plane settle what they can for
+all pairs below; what is left of the occluders is handed down.  A single pair is then clear (quadrature
+chosen by distance, or the closed form), hidden, or seen in part: the sender is cut exactly at the points of
+a rule that is refined until the wanted error is met.  Long candidate lists are left to rays.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from radiosity.form_factors._contour import CONTOUR_ROWS, contour_integral_in
+from radiosity.form_factors.analytic import _clip_pair
+from workbench.culling.plane_vertex import outside_planes
+from workbench.culling.shaft import box_shaft_in
+from workbench.culling.tally import (
+    CLEAR,
+    CLOSED,
+    COMPLEX,
+    CUT,
+    DARK,
+    EMPTY,
+    HORIZON,
+    LINK,
+    OVERFLOW,
+    PIECES,
+    SHAFT,
+    SHAFT_CULL,
+    SHAFT_TEST,
+)
+from workbench.geometry.lambert import _HALF_OVER_PI, _edge_term, lambert_piece
+
+MAX_CUT = 32
+"""Longest candidate list of a pair that is cut exactly."""
+MAX_FRAGMENTS = 96
+"""Visible fragments of a sender after which a pair is left to rays."""
+ROOM = 24
+"""Corners that a fragment may have."""
+
+_INV_PI = 1.0 / math.pi
+
+_PLAIN = {"nogil": True, "cache": True, "_nrt": False}
+"""Kernels that allocate nothing and so need not count references: counting those of the many arrays that they
+hand on takes longer than all their arithmetic, and threads would fight over the counts."""
+
+
+def pair_workspace(max_corners):
+    """Scratch of one thread: fragments, their sizes and weights, crossings, a clipped pair, kept occluders."""
+    room = max(ROOM, 2 * max_corners + 6)
+    return (
+        np.empty((MAX_FRAGMENTS + 2, room, 3)),
+        np.empty(MAX_FRAGMENTS + 2, dtype=np.int64),
+        np.empty(MAX_FRAGMENTS + 2),
+        np.empty((4 * room * room, 2)),
+        np.empty((4, 2 * room, 3)),
+        np.empty(MAX_CUT, dtype=np.int64),
+        np.empty((CONTOUR_ROWS, 3)),
+        np.empty(4),
+    )
+
+
+@njit(**_PLAIN)
+def subtract(corners, k0, k1, nx, ny, nz, d, through, x, y, z, fragments, sizes, weights, count, near):
+    """Take from the fragments (relative to (x, y, z)) what one convex occluder hides from that point.
+
+    The hidden part of space is convex: inside the cone of the occluder's edges and beyond its plane, so
+    neither the occluder nor the sender needs to be cut by the other's plane first.  Returns the new
+    number of fragments, -1 if there is no room.
+    """
+    height = nx * x + ny * y + nz * z - d
+    if abs(height) <= near:
+        return count
+    sign = 1.0 if height > 0.0 else -1.0
+    capacity = MAX_FRAGMENTS
+    spare = capacity + 1
+    room = fragments.shape[1]
+    done = 0
+    while done < count:
+        size = sizes[done]
+        # First look: wholly outside one plane means untouched.
+        untouched = True
+        cuts = False
+        for i in range(size):
+            if (
+                -sign * (nx * fragments[done, i, 0] + ny * fragments[done, i, 1] + nz * fragments[done, i, 2])
+                - abs(height)
+                > near
+            ):
+                untouched = False
+            else:
+                cuts = True
+        k = k0
+        while not untouched and k < k1:
+            m = k + 1 if k + 1 < k1 else k0
+            ax, ay, az = corners[k, 0] - x, corners[k, 1] - y, corners[k, 2] - z
+            bx, by, bz = corners[m, 0] - x, corners[m, 1] - y, corners[m, 2] - z
+            px, py, pz = sign * (az * by - ay * bz), sign * (ax * bz - az * bx), sign * (ay * bx - ax * by)
+            tiny = near * (abs(px) + abs(py) + abs(pz))
+            outside = True
+            for i in range(size):
+                if px * fragments[done, i, 0] + py * fragments[done, i, 1] + pz * fragments[done, i, 2] > tiny:
+                    outside = False
+                    break
+            untouched = outside
+            k += 1
+        if untouched:
+            done += 1
+            continue
+        # Cut off, plane by plane, what lies outside; the rest is hidden.
+        k = k0 - 1 if cuts else k0
+        while k < k1 and size > 0:
+            if k < k0:
+                px, py, pz, off, tiny = -sign * nx, -sign * ny, -sign * nz, -abs(height), near
+            else:
+                m = k + 1 if k + 1 < k1 else k0
+                ax, ay, az = corners[k, 0] - x, corners[k, 1] - y, corners[k, 2] - z
+                bx, by, bz = corners[m, 0] - x, corners[m, 1] - y, corners[m, 2] - z
+                px, py, pz = sign * (az * by - ay * bz), sign * (ax * bz - az * bx), sign * (ay * bx - ax * by)
+                off = 0.0
+                tiny = near * (abs(px) + abs(py) + abs(pz))
+            k += 1
+            any_out = False
+            for i in range(size):
+                if px * fragments[done, i, 0] + py * fragments[done, i, 1] + pz * fragments[done, i, 2] + off < -tiny:
+                    any_out = True
+                    break
+            if not any_out:
+                continue
+            if count == capacity or size + 2 > room:
+                return -1
+            # Inside part to the scratch row, outside part to a new fragment.
+            ins = outs = 0
+            in_any = out_any = False
+            qx, qy, qz = fragments[done, size - 1, 0], fragments[done, size - 1, 1], fragments[done, size - 1, 2]
+            dq = px * qx + py * qy + pz * qz + off
+            if abs(dq) <= tiny:
+                dq = 0.0
+            for i in range(size):
+                cx, cy, cz = fragments[done, i, 0], fragments[done, i, 1], fragments[done, i, 2]
+                dc = px * cx + py * cy + pz * cz + off
+                if abs(dc) <= tiny:
+                    dc = 0.0
+                if (dq > 0.0 and dc < 0.0) or (dq < 0.0 and dc > 0.0):
+                    t = dq / (dq - dc)
+                    ex, ey, ez = qx + t * (cx - qx), qy + t * (cy - qy), qz + t * (cz - qz)
+                    fragments[spare, ins, 0], fragments[spare, ins, 1], fragments[spare, ins, 2] = ex, ey, ez
+                    fragments[count, outs, 0], fragments[count, outs, 1], fragments[count, outs, 2] = ex, ey, ez
+                    ins += 1
+                    outs += 1
+                if dc >= 0.0:
+                    fragments[spare, ins, 0], fragments[spare, ins, 1], fragments[spare, ins, 2] = cx, cy, cz
+                    ins += 1
+                    in_any = in_any or dc > 0.0
+                if dc <= 0.0:
+                    fragments[count, outs, 0], fragments[count, outs, 1], fragments[count, outs, 2] = cx, cy, cz
+                    outs += 1
+                    out_any = out_any or dc < 0.0
+                qx, qy, qz, dq = cx, cy, cz, dc
+            if out_any and outs >= 3:
+                sizes[count] = outs
+                weights[count] = weights[done]
+                count += 1
+            size = ins if in_any and ins >= 3 else 0
+            for i in range(size):
+                fragments[done, i, 0], fragments[done, i, 1], fragments[done, i, 2] = (
+                    fragments[spare, i, 0],
+                    fragments[spare, i, 1],
+                    fragments[spare, i, 2],
+                )
+        if through > 0.0 and size > 0:
+            sizes[done] = size
+            weights[done] *= through
+            done += 1
+            continue
+        # The hidden rest gives its row to the last fragment.  That one is new (it lay outside this occluder)
+        # or not yet looked at; new ones are looked at again, which finds them untouched.
+        count -= 1
+        if done != count:
+            for i in range(sizes[count]):
+                fragments[done, i, 0], fragments[done, i, 1], fragments[done, i, 2] = (
+                    fragments[count, i, 0],
+                    fragments[count, i, 1],
+                    fragments[count, i, 2],
+                )
+            sizes[done] = sizes[count]
+            weights[done] = weights[count]
+    return count
+
+
+@njit(**_PLAIN)
+def _fragment_share(fragments, row, count, nx, ny, nz):
+    """Lambert's formula for a fragment seen from the origin (no view of its row: counting views costs more)."""
+    total = 0.0
+    has_exit = has_entry = False
+    outx = outy = outz = inx = iny = inz = 0.0
+    px, py, pz = fragments[row, count - 1, 0], fragments[row, count - 1, 1], fragments[row, count - 1, 2]
+    dp = nx * px + ny * py + nz * pz
+    for i in range(count):
+        cx, cy, cz = fragments[row, i, 0], fragments[row, i, 1], fragments[row, i, 2]
+        dc = nx * cx + ny * cy + nz * cz
+        if dp >= 0.0:
+            if dc >= 0.0:
+                total += _edge_term(px, py, pz, cx, cy, cz, nx, ny, nz)
+            else:
+                t = dp / (dp - dc)
+                outx, outy, outz = px + t * (cx - px), py + t * (cy - py), pz + t * (cz - pz)
+                has_exit = True
+                total += _edge_term(px, py, pz, outx, outy, outz, nx, ny, nz)
+        elif dc >= 0.0:
+            t = dp / (dp - dc)
+            inx, iny, inz = px + t * (cx - px), py + t * (cy - py), pz + t * (cz - pz)
+            has_entry = True
+            total += _edge_term(inx, iny, inz, cx, cy, cz, nx, ny, nz)
+        px, py, pz, dp = cx, cy, cz, dc
+    if has_exit and has_entry:
+        total += _edge_term(outx, outy, outz, inx, iny, inz, nx, ny, nz)
+    return -total * _HALF_OVER_PI
+
+
+@njit(**_PLAIN)
+def seen_share(
+    x, y, z, nx, ny, nz, target, t0, t1, corners, start, normal, offset, through, kept, many, fragments, sizes,
+    weights, tally,
+):  # fmt: skip
+    """Form factor from a point to what it sees of a convex polygon past its occluders; -1 without room.
+
+    ``kept[:many]`` are the occluders ``corners[start[k]:start[k + 1]]``.
+    """
+    reach = 0.0
+    for i in range(t1 - t0):
+        rx, ry, rz = target[t0 + i, 0] - x, target[t0 + i, 1] - y, target[t0 + i, 2] - z
+        fragments[0, i, 0], fragments[0, i, 1], fragments[0, i, 2] = rx, ry, rz
+        reach = max(reach, abs(rx), abs(ry), abs(rz))
+    sizes[0] = t1 - t0
+    weights[0] = 1.0
+    count = 1
+    near = 1e-12 * reach
+    for c in range(many):
+        k = kept[c]
+        count = subtract(
+            corners, start[k], start[k + 1], normal[k, 0], normal[k, 1], normal[k, 2], offset[k], through[k], x, y, z,
+            fragments, sizes, weights, count, near,
+        )  # fmt: skip
+        if count <= 0:
+            break
+    if count < 0:
+        tally[OVERFLOW] += 1
+        return -1.0
+    tally[CUT] += 1
+    tally[PIECES] += count
+    total = 0.0
+    for f in range(count):
+        total += weights[f] * max(_fragment_share(fragments, f, sizes[f], nx, ny, nz), 0.0)
+    return total
+
+
+@njit(**_PLAIN)
+def crossings(a, a0, a1, b, b0, b1, nx, ny, nz, d, ox, oy, oz, ux, uy, uz, vx, vy, vz, slack, out):
+    """Where the segments between the corners of two polygons cross a plane: rows (u, v) of ``out``.
+
+    The crossing of any segment between the polygons lies in their convex hull.  Returns their number,
+    and whether the plane separates the polygons (touching it at most).
+    """
+    count = 0
+    separates = True
+    side = 0.0
+    for i in range(a0, a1):
+        hx, hy, hz = a[i, 0] - ox, a[i, 1] - oy, a[i, 2] - oz
+        ha = nx * a[i, 0] + ny * a[i, 1] + nz * a[i, 2] - d
+        if abs(ha) <= slack:
+            out[count, 0] = ux * hx + uy * hy + uz * hz
+            out[count, 1] = vx * hx + vy * hy + vz * hz
+            count += 1
+            continue
+        if ha * side < 0.0:
+            separates = False
+        side = ha
+        # Where an edge of a itself crosses the plane, segments leave from the plane.
+        m = i + 1 if i + 1 < a1 else a0
+        hm = nx * a[m, 0] + ny * a[m, 1] + nz * a[m, 2] - d
+        if abs(hm) > slack and ha * hm < 0.0:
+            t = ha / (ha - hm)
+            px, py, pz = hx + t * (a[m, 0] - a[i, 0]), hy + t * (a[m, 1] - a[i, 1]), hz + t * (a[m, 2] - a[i, 2])
+            out[count, 0], out[count, 1] = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
+            count += 1
+        for j in range(b0, b1):
+            hb = nx * b[j, 0] + ny * b[j, 1] + nz * b[j, 2] - d
+            if abs(hb) <= slack or ha * hb > 0.0:
+                continue
+            t = ha / (ha - hb)
+            px, py, pz = hx + t * (b[j, 0] - a[i, 0]), hy + t * (b[j, 1] - a[i, 1]), hz + t * (b[j, 2] - a[i, 2])
+            out[count, 0], out[count, 1] = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
+            count += 1
+    for j in range(b0, b1):
+        hb = nx * b[j, 0] + ny * b[j, 1] + nz * b[j, 2] - d
+        hx, hy, hz = b[j, 0] - ox, b[j, 1] - oy, b[j, 2] - oz
+        if abs(hb) <= slack:
+            out[count, 0] = ux * hx + uy * hy + uz * hz
+            out[count, 1] = vx * hx + vy * hy + vz * hz
+            count += 1
+            continue
+        if hb * side > 0.0:
+            separates = False
+        m = j + 1 if j + 1 < b1 else b0
+        hm = nx * b[m, 0] + ny * b[m, 1] + nz * b[m, 2] - d
+        if abs(hm) > slack and hb * hm < 0.0:
+            separates = False
+            t = hb / (hb - hm)
+            px, py, pz = hx + t * (b[m, 0] - b[j, 0]), hy + t * (b[m, 1] - b[j, 1]), hz + t * (b[m, 2] - b[j, 2])
+            out[count, 0], out[count, 1] = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
+            count += 1
+    return count, separates
+
+
+CLEARS, HIDES, TOUCHES = 0, 1, 2
+
+
+@njit(**_PLAIN)
+def verdict(points, count, separates, flat, f0, f1, lows, highs, k, slack):
+    """Whether an occluder in its plane's frame ``flat[f0:f1]`` clears, hides or touches all crossings."""
+    if count == 0:
+        return CLEARS
+    ulow = vlow = math.inf
+    uhigh = vhigh = -math.inf
+    for i in range(count):
+        u, v = points[i, 0], points[i, 1]
+        ulow, uhigh = min(ulow, u), max(uhigh, u)
+        vlow, vhigh = min(vlow, v), max(vhigh, v)
+    if uhigh <= lows[k, 0] + slack or ulow >= highs[k, 0] - slack:
+        return CLEARS
+    if vhigh <= lows[k, 1] + slack or vlow >= highs[k, 1] - slack:
+        return CLEARS
+    inside_all = separates
+    for e in range(f0, f1):
+        m = e + 1 if e + 1 < f1 else f0
+        eu, ev = flat[m, 0] - flat[e, 0], flat[m, 1] - flat[e, 1]
+        tiny = slack * (abs(eu) + abs(ev))
+        outside = True
+        for i in range(count):
+            turn = eu * (points[i, 1] - flat[e, 1]) - ev * (points[i, 0] - flat[e, 0])
+            if turn > tiny:
+                outside = False
+            if turn < -tiny:
+                inside_all = False
+            if not outside and not inside_all:
+                break
+        if outside:
+            return CLEARS
+    return HIDES if inside_all else TOUCHES
+
+
+@njit(**_PLAIN)
+def _span(normals, offsets, k, low, high, node):
+    """Lowest and highest ``n . x - d`` of plane ``k`` over the box of a node."""
+    lo = hi = -offsets[k]
+    for axis in range(3):
+        n = normals[k, axis]
+        if n > 0.0:
+            lo += n * low[node, axis]
+            hi += n * high[node, axis]
+        else:
+            lo += n * high[node, axis]
+            hi += n * low[node, axis]
+    return lo, hi
+
+
+@njit(**_PLAIN)
+def _heights(nx, ny, nz, d, corners, a, b):
+    """Lowest and highest ``n . x - d`` of corners."""
+    lo, hi = math.inf, -math.inf
+    for i in range(a, b):
+        h = nx * corners[i, 0] + ny * corners[i, 1] + nz * corners[i, 2] - d
+        lo, hi = min(lo, h), max(hi, h)
+    return lo, hi
+
+
+@njit(**_PLAIN, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
+def _kernel_sum(p, p0, p1, nx, ny, nz, q, q0, q1, mx, my, mz):
+    """Product rule on the kernel cos cos / (pi r^2) between two sets of weighted points."""
+    total = 0.0
+    for i in range(p0, p1):
+        x, y, z, w = p[i, 0], p[i, 1], p[i, 2], p[i, 3]
+        row = 0.0
+        for j in range(q0, q1):
+            dx, dy, dz = q[j, 0] - x, q[j, 1] - y, q[j, 2] - z
+            square = dx * dx + dy * dy + dz * dz
+            row += q[j, 3] * (dx * nx + dy * ny + dz * nz) * -(dx * mx + dy * my + dz * mz) / (square * square)
+        total += w * row
+    return total * _INV_PI
+
+
+@njit(**_PLAIN)
+def _lambert_sum(p, p0, p1, nx, ny, nz, corners, c0, c1):
+    """Rule on Lambert's formula for one convex polygon."""
+    total = 0.0
+    for i in range(p0, p1):
+        total += p[i, 3] * lambert_piece(p[i, 0], p[i, 1], p[i, 2], nx, ny, nz, corners, c0, c1)
+    return total
+
+
+@njit(**_PLAIN)
+def _gap(centroid, s, low, high, t):
+    """Distance of the centroid of piece ``s`` from the box of piece ``t``."""
+    square = 0.0
+    for axis in range(3):
+        off = max(low[t, axis] - centroid[s, axis], 0.0, centroid[s, axis] - high[t, axis])
+        square += off * off
+    return math.sqrt(square)
+
+
+POINT_RULE, COARSE_RULE, FINE_RULE, LAMBERT_RULE = 0.45, 0.26, 0.065, 0.04
+"""Relative errors of the rules at a distance of one radius, root mean square over the pairs of rooms in triangles;
+they fall with its 2nd, 4th and (both others) 5.6th power."""
+
+
+@njit(**_PLAIN)
+def rule_doubt(value, facing, factor, power, ratio):
+    """Estimate of a rule's error."""
+    return factor * ratio**power * math.sqrt(max(value, 0.0) * max(facing, value))
+
+
+@njit(**_PLAIN)
+def open_exchange(
+    i, j, straddle, corners, start, normal, offset, centroid, area, radius, low, high, rule, rule_start, fine,
+    fine_start, reach, error, work, contour, tally,
+):  # fmt: skip
+    """Exchange area of two pieces that see each other whole, and the estimate of its error.
+
+    Far apart: a product rule of a few points on the kernel; nearer: Lambert's formula over the smaller;
+    near and touching: the closed form.  ``reach`` (4,) are the distances, in radii, from which each rule
+    meets the wanted relative error ``error``.
+    """
+    tally[CLOSED] += 1
+    if not straddle:
+        dx, dy, dz = centroid[i, 0] - centroid[j, 0], centroid[i, 1] - centroid[j, 1], centroid[i, 2] - centroid[j, 2]
+        square = dx * dx + dy * dy + dz * dz
+        distance = math.sqrt(square)
+        larger = max(radius[i], radius[j])
+        # What the pair would exchange face to face: at grazing angles errors are larger than their share.
+        facing = area[i] * area[j] * _INV_PI / square if square > 0.0 else 0.0
+        if distance > reach[0] * larger:
+            value = (
+                area[i] * area[j] * (dx * normal[j, 0] + dy * normal[j, 1] + dz * normal[j, 2])
+                * -(dx * normal[i, 0] + dy * normal[i, 1] + dz * normal[i, 2]) / (square * square) * _INV_PI
+            )  # fmt: skip
+            value = max(value, 0.0)
+            return value, rule_doubt(value, facing, POINT_RULE, 2.0, larger / distance)
+        if distance > reach[1] * larger:
+            value = _kernel_sum(
+                rule, rule_start[0, i], rule_start[0, i + 1], normal[i, 0], normal[i, 1], normal[i, 2],
+                rule, rule_start[0, j], rule_start[0, j + 1], normal[j, 0], normal[j, 1], normal[j, 2],
+            )  # fmt: skip
+            return value, rule_doubt(value, facing, COARSE_RULE, 4.0, larger / distance)
+        if distance > reach[2] * larger:
+            value = _kernel_sum(
+                fine, fine_start[i], fine_start[i + 1], normal[i, 0], normal[i, 1], normal[i, 2],
+                fine, fine_start[j], fine_start[j + 1], normal[j, 0], normal[j, 1], normal[j, 2],
+            )  # fmt: skip
+            return value, rule_doubt(value, facing, FINE_RULE, 5.6, larger / distance)
+        s, t = (i, j) if radius[i] <= radius[j] else (j, i)
+        gap = _gap(centroid, s, low, high, t)
+        if gap > reach[3] * radius[s]:
+            value = _lambert_sum(
+                fine, fine_start[s], fine_start[s + 1], normal[s, 0], normal[s, 1], normal[s, 2], corners, start[t],
+                start[t + 1],
+            )  # fmt: skip
+            return value, rule_doubt(value, facing, LAMBERT_RULE, 5.6, radius[s] / gap)
+    m, k = _clip_pair(
+        corners, start[i], start[i + 1], normal[i], corners, start[j], start[j + 1], normal[j], work
+    )  # fmt: skip
+    if m <= 0 or k <= 0:
+        return 0.0, 0.0
+    smaller = min(area[i], area[j])
+    value, rounding = contour_integral_in(work[2], m, work[3], k, 0.1 * error * smaller, contour)
+    # Never above what one of them can send; a closer look where little is exchanged.
+    if value < 0.3 * smaller:
+        tolerance = max(0.5 * error * value, 1e-12 * smaller)
+        if tolerance < 0.05 * error * smaller:
+            value, rounding = contour_integral_in(work[2], m, work[3], k, tolerance, contour)
+        return value, tolerance + rounding
+    return min(value, smaller), 0.1 * error * smaller + rounding
+
+
+@njit(**_PLAIN)
+def _sampled(
+    i, j, points, p0, p1, corners, start, normal, kc, ks, kn, kd, through, kept, many, fragments, sizes, weights,
+    tally, sums,
+):  # fmt: skip
+    """Visible and open form factors of piece j, summed over points of piece i; whether there was room.
+
+    ``sums``: visible, open, and the least and largest visible share.
+    """
+    nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+    mx, my, mz = normal[j, 0], normal[j, 1], normal[j, 2]
+    t0, t1 = start[j], start[j + 1]
+    d = mx * corners[t0, 0] + my * corners[t0, 1] + mz * corners[t0, 2]
+    seen = whole = 0.0
+    least, most = math.inf, 0.0
+    for p in range(p0, p1):
+        x, y, z, w = points[p, 0], points[p, 1], points[p, 2], points[p, 3]
+        if mx * x + my * y + mz * z - d <= 0.0:
+            continue
+        clear = lambert_piece(x, y, z, nx, ny, nz, corners, t0, t1)
+        if clear <= 0.0:
+            continue
+        share = seen_share(
+            x, y, z, nx, ny, nz, corners, t0, t1, kc, ks, kn, kd, through, kept, many, fragments, sizes, weights, tally
+        )  # fmt: skip
+        if share < 0.0:
+            return False
+        whole += w * clear
+        seen += w * share
+        part = share / clear
+        least, most = min(least, part), max(most, part)
+    sums[0], sums[1], sums[2], sums[3] = seen, whole, least, most
+    return True
+
+
+@njit(**_PLAIN)
+def partial_share(
+    i, j, goal, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, many, fragments,
+    sizes, weights, sums, tally,
+):  # fmt: skip
+    """Visible share of the exchange of two pieces and the estimate of its error; -1 if rays must tell.
+
+    Points of ever finer rules on piece i, until two in a row agree to ``goal``.
+    """
+    before, doubt = -1.0, 1.0
+    share = 0.0
+    for level in range(levels):
+        if not _sampled(
+            i, j, rules, rule_starts[level, i], rule_starts[level, i + 1], corners, start, normal, kc, ks, kn,
+            kd, through, kept, many, fragments, sizes, weights, tally, sums,
+        ):  # fmt: skip
+            return -1.0, 1.0
+        if sums[1] <= 0.0:
+            before = -1.0
+            continue
+        share = min(sums[0] / sums[1], 1.0)
+        spread = sums[3] - sums[2]
+        points = rule_starts[level, i + 1] - rule_starts[level, i]
+        # Both factors by comparison with ever finer rules, in rooms in triangles: their root mean square is kept.
+        if before < 0.0:
+            doubt = 0.2 * spread / math.sqrt(points) + 0.06 / points
+        else:
+            doubt = 0.25 * abs(share - before) + 0.18 * spread / points + 0.015 / points
+        if doubt <= goal:
+            break
+        before = share
+    return share, doubt
+
+
+@njit(**_PLAIN)
+def _one_pair(
+    i, j, straddle, begin, many, arena, limit, error, share_error, floor, levels, reach, corners, start, normal,
+    offset, centroid, area, radius, low, high, group, rules, rule_starts, fine, fine_start, kc, ks, kn, kd, kg,
+    through, frame, flat, flow, fhigh, slack, fragments, sizes, weights, points, pair, kept, contour, sums, tally,
+):  # fmt: skip
+    """Exchange area of a pair, its error, and 1 if rays must scale it."""
+    used = 0
+    overflow = False
+    for c in range(begin, begin + many):
+        k = arena[c]
+        if kg[k] == group[i] or kg[k] == group[j]:
+            continue
+        tally[SHAFT_TEST] += 1
+        ka, kb = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], corners, start[i], start[i + 1])
+        la, lb = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], corners, start[j], start[j + 1])
+        if (ka >= -slack and la >= -slack) or (kb <= slack and lb <= slack):
+            tally[SHAFT_CULL] += 1
+            continue
+        many_crossings, separates = crossings(
+            corners, start[i], start[i + 1], corners, start[j], start[j + 1], kn[k, 0], kn[k, 1], kn[k, 2], kd[k],
+            frame[k, 0], frame[k, 1], frame[k, 2], frame[k, 3], frame[k, 4], frame[k, 5], frame[k, 6], frame[k, 7],
+            frame[k, 8], slack, points,
+        )  # fmt: skip
+        what = verdict(points, many_crossings, separates, flat, ks[k], ks[k + 1], flow, fhigh, k, slack)
+        if what == CLEARS:
+            tally[SHAFT_CULL] += 1
+            continue
+        if what == HIDES and through[k] == 0.0:
+            tally[DARK] += 1
+            return 0.0, 0.0, 0
+        if used >= limit:
+            overflow = True
+        else:
+            kept[used] = k
+            used += 1
+    value, doubt = open_exchange(
+        i, j, straddle, corners, start, normal, offset, centroid, area, radius, low, high, rules, rule_starts,
+        fine, fine_start, reach, error, pair, contour, tally,
+    )  # fmt: skip
+    if value <= 0.0:
+        return 0.0, doubt, 0
+    tally[LINK] += 1
+    if used == 0 and not overflow:
+        tally[CLEAR] += 1
+        return value, doubt, 0
+    tally[COMPLEX] += 1
+    if overflow:
+        return value, doubt, 1
+    s, t = (i, j) if radius[i] <= radius[j] else (j, i)
+    goal = share_error * (1.0 + floor * min(area[i], area[j]) / value)
+    share, uncertain = partial_share(
+        s, t, goal, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, used,
+        fragments, sizes, weights, sums, tally,
+    )  # fmt: skip
+    if share < 0.0:
+        return value, doubt, 1
+    return value * share, doubt * share + value * uncertain, 0
+
+
+@njit(**_PLAIN)
+def _box_corners(low, high, node, out, row):
+    """The eight corners of a node's box; flat boxes give four."""
+    count = row
+    for c in range(8):
+        skip = False
+        for axis in range(3):
+            if c >> axis & 1 and high[node, axis] == low[node, axis]:
+                skip = True
+        if skip:
+            continue
+        for axis in range(3):
+            out[count, axis] = high[node, axis] if c >> axis & 1 else low[node, axis]
+        count += 1
+    return count
+
+
+@njit(**_PLAIN)
+def node_candidates(
+    a, b, arena, begin, many, node_low, node_high, node_group, plane_normal, plane_offset, kc, ks, kn, kd, kg, through,
+    frame, flat, flow, fhigh, klow, khigh, slack, shaft, points, box, tally,
+):  # fmt: skip
+    """Occluders of ``arena[begin:begin + many]`` that may come between two nodes, put behind them.
+
+    Returns their number, -1 if one hides all.
+    """
+    end = begin + many
+    used = -1
+    count = 0
+    ga, gb = node_group[a], node_group[b]
+    m = k2 = 0
+    tally[SHAFT] += 1
+    for c in range(begin, end):
+        k = arena[c]
+        if (ga >= 0 and kg[k] == ga) or (gb >= 0 and kg[k] == gb):
+            continue
+        tally[SHAFT_TEST] += 1
+        apart = False
+        for axis in range(3):
+            if (
+                klow[k, axis] > max(node_high[a, axis], node_high[b, axis]) + slack
+                or khigh[k, axis] < min(node_low[a, axis], node_low[b, axis]) - slack
+            ):
+                apart = True
+        if apart:
+            tally[SHAFT_CULL] += 1
+            continue
+        alo, ahi = _span(kn, kd, k, node_low, node_high, a)
+        blo, bhi = _span(kn, kd, k, node_low, node_high, b)
+        if (alo >= -slack and blo >= -slack) or (ahi <= slack and bhi <= slack):
+            tally[SHAFT_CULL] += 1
+            continue
+        # Behind the plane of either end.
+        if ga >= 0:
+            _, hi = _heights(
+                plane_normal[a, 0], plane_normal[a, 1], plane_normal[a, 2], plane_offset[a], kc, ks[k], ks[k + 1]
+            )
+            if hi <= slack:
+                tally[SHAFT_CULL] += 1
+                continue
+        if gb >= 0:
+            _, hi = _heights(
+                plane_normal[b, 0], plane_normal[b, 1], plane_normal[b, 2], plane_offset[b], kc, ks[k], ks[k + 1]
+            )
+            if hi <= slack:
+                tally[SHAFT_CULL] += 1
+                continue
+        if used < 0:
+            used = box_shaft_in(node_low[a], node_high[a], node_low[b], node_high[b], shaft, points)
+            # What only touches the shaft from outside hides a null set.
+            for p in range(used):
+                shaft[p, 3] += 2.0 * slack
+            m = _box_corners(node_low, node_high, a, box, 0)
+            k2 = _box_corners(node_low, node_high, b, box, m)
+        if outside_planes(kc, ks[k], ks[k + 1], shaft, used, slack):
+            tally[SHAFT_CULL] += 1
+            continue
+        if (alo >= -slack and bhi <= slack) or (ahi <= slack and blo >= -slack):
+            crossed, _ = crossings(
+                box, 0, m, box, m, k2, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], frame[k, 0], frame[k, 1], frame[k, 2],
+                frame[k, 3], frame[k, 4], frame[k, 5], frame[k, 6], frame[k, 7], frame[k, 8], slack, points,
+            )  # fmt: skip
+            what = verdict(points, crossed, True, flat, ks[k], ks[k + 1], flow, fhigh, k, slack)
+            if what == CLEARS:
+                tally[SHAFT_CULL] += 1
+                continue
+            # A piece in the occluder's own plane is not hidden by it: a mixed node must keep off that plane.
+            off_a = ga >= 0 or alo > slack or ahi < -slack
+            off_b = gb >= 0 or blo > slack or bhi < -slack
+            if what == HIDES and through[k] == 0.0 and off_a and off_b:
+                return -1
+        arena[end + count] = k
+        count += 1
+    if count == 0:
+        tally[EMPTY] += 1
+    return count
+
+
+@njit(**_PLAIN)
+def stripe(
+    top, node_first, node_last, node_left, node_right, node_low, node_high, node_group, plane_normal, plane_offset,
+    corners, start, normal, offset, centroid, area, radius, low, high, group, rules, rule_starts, fine, fine_start,
+    kc, ks, kn, kd, kg, through, frame, flat, flow, fhigh, klow, khigh, slack, error, share_error, floor, levels,
+    reach, limit, fragments, sizes, weights, points, pair, kept, contour, sums, shaft, box,
+    arena, stack, out, spread, flagged, tally,
+):  # fmt: skip
+    """Exchange areas of the pieces of node ``top`` with all pieces that come after each.
+
+    ``out`` and ``spread`` (rows of the node, pieces); ``flagged`` (m, 2) gets the pairs for rays, whose ``out``
+    is the open exchange.  Returns the number of flagged pairs, or more than there is room for.
+    """
+    base = node_first[top]
+    flags = 0
+    total = ks.shape[0] - 1
+    for k in range(total):
+        arena[k] = k
+    # Rows of the stack: node a, node b, first and number of the candidates, whether both ends are settled.
+    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = top, 0, 0, total
+    depth = 0
+    while depth >= 0:
+        a, b, begin, many = stack[depth, 0], stack[depth, 1], stack[depth, 2], stack[depth, 3]
+        depth -= 1
+        if node_last[b] <= node_first[a] + 1:
+            continue
+        ga, gb = node_group[a], node_group[b]
+        pairs = (node_last[a] - node_first[a]) * (node_last[b] - node_first[b])
+        if ga >= 0 and ga == gb:
+            # One plane and, as groups are kept by side, one facing; two sides of a sheet never meet either.
+            tally[HORIZON] += pairs
+            continue
+        if ga >= 0:
+            lo, hi = _span(plane_normal, plane_offset, a, node_low, node_high, b)
+            if hi <= slack:
+                tally[HORIZON] += pairs
+                continue
+        if gb >= 0:
+            lo, hi = _span(plane_normal, plane_offset, b, node_low, node_high, a)
+            if hi <= slack:
+                tally[HORIZON] += pairs
+                continue
+        end = begin + many
+        if many > 0:
+            count = node_candidates(
+                a, b, arena, begin, many, node_low, node_high, node_group, plane_normal, plane_offset,
+                kc, ks, kn, kd, kg, through, frame, flat, flow, fhigh, klow, khigh, slack, shaft, points, box, tally,
+            )  # fmt: skip
+            if count < 0:
+                tally[DARK] += pairs
+                continue
+            begin, many = end, count
+        leaf_a, leaf_b = node_left[a] < 0, node_left[b] < 0
+        if not (leaf_a and leaf_b) and (many > 0 or ga < 0 or gb < 0 or pairs > 4096):
+            wide_a = wide_b = 0.0
+            for axis in range(3):
+                wide_a = max(wide_a, node_high[a, axis] - node_low[a, axis])
+                wide_b = max(wide_b, node_high[b, axis] - node_low[b, axis])
+            if leaf_b or (not leaf_a and wide_a > wide_b):
+                for side in range(2):
+                    depth += 1
+                    stack[depth, 0] = node_right[a] if side == 0 else node_left[a]
+                    stack[depth, 1], stack[depth, 2], stack[depth, 3] = b, begin, many
+            else:
+                for side in range(2):
+                    depth += 1
+                    stack[depth, 1] = node_right[b] if side == 0 else node_left[b]
+                    stack[depth, 0], stack[depth, 2], stack[depth, 3] = a, begin, many
+            continue
+        nearest = reach[0] if many == 0 else math.inf
+        for i in range(node_first[a], node_last[a]):
+            nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+            cx, cy, cz = centroid[i, 0], centroid[i, 1], centroid[i, 2]
+            for j in range(max(node_first[b], i + 1), node_last[b]):
+                mx, my, mz = normal[j, 0], normal[j, 1], normal[j, 2]
+                dx, dy, dz = centroid[j, 0] - cx, centroid[j, 1] - cy, centroid[j, 2] - cz
+                # Heights of the centroids over the other's plane, against radii: most pairs need no more.
+                over_i, over_j = nx * dx + ny * dy + nz * dz, -(mx * dx + my * dy + mz * dz)
+                if over_i <= -radius[j] or over_j <= -radius[i]:
+                    tally[HORIZON] += 1
+                    continue
+                straddle = False
+                if over_i < radius[j]:
+                    lo, hi = _heights(nx, ny, nz, offset[i], corners, start[j], start[j + 1])
+                    if hi <= slack:
+                        tally[HORIZON] += 1
+                        continue
+                    straddle = lo < -slack
+                if over_j < radius[i]:
+                    lo, hi = _heights(mx, my, mz, offset[j], corners, start[i], start[i + 1])
+                    if hi <= slack:
+                        tally[HORIZON] += 1
+                        continue
+                    straddle = straddle or lo < -slack
+                square = dx * dx + dy * dy + dz * dz
+                limit_distance = nearest * max(radius[i], radius[j])
+                if not straddle and square > limit_distance * limit_distance:
+                    value = area[i] * area[j] * over_i * over_j / (square * square) * _INV_PI
+                    out[i - base, j] = value
+                    spread[i - base, j] = rule_doubt(
+                        value, area[i] * area[j] * _INV_PI / square, POINT_RULE, 2.0,
+                        max(radius[i], radius[j]) / math.sqrt(square),
+                    )  # fmt: skip
+                    tally[CLOSED] += 1
+                    tally[CLEAR] += 1
+                    tally[LINK] += 1
+                    continue
+                value, doubt, rays = _one_pair(
+                    i, j, straddle, begin, many, arena, limit, error, share_error, floor, levels, reach, corners,
+                    start, normal, offset, centroid, area, radius, low, high, group, rules, rule_starts, fine,
+                    fine_start, kc, ks, kn, kd, kg, through, frame, flat, flow, fhigh, slack, fragments, sizes, weights,
+                    points, pair, kept, contour, sums, tally,
+                )  # fmt: skip
+                out[i - base, j] = value
+                spread[i - base, j] = doubt
+                if rays:
+                    if flags < flagged.shape[0]:
+                        flagged[flags, 0], flagged[flags, 1] = i, j
+                    flags += 1
+    return flags

@@ -1,0 +1,145 @@
+"""Visible shares of exchange areas by rays, for pairs with too many occluders to cut."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from radiosity.form_factors._sampling import place_on_pieces, stream
+from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+FIRST_RAYS = 32
+"""Rays of a pair before it is known how much they differ."""
+MOST_RAYS = 2048
+
+# Generalised golden ratio in four dimensions (M. Roberts 2018): g solves g^5 = g + 1.
+_G4 = 1.1673039782614187
+
+
+@njit(nogil=True, cache=True)
+def _pair_rays(
+    pairs, begin, counts, seed, corners, start, normal, area, offset, centre, scale, starts, origins, directions,
+    weights,
+):  # fmt: skip
+    """Rays between points of both pieces, in Embree's unit frame, each with its kernel cos cos / r^2.
+
+    Pair ``p`` gets rays ``starts[p]:starts[p + 1]``, numbers ``begin[p]`` to ``begin[p] + counts[p]`` of its
+    sequence; those between points that do not face each other are left out.  Returns their number.
+    """
+    x, y = np.empty(3), np.empty(3)
+    g1, g2, g3, g4 = 1.0 / _G4, 1.0 / _G4**2, 1.0 / _G4**3, 1.0 / _G4**4
+    row = 0
+    for p in range(pairs.shape[0]):
+        starts[p] = row
+        i, j = pairs[p, 0], pairs[p, 1]
+        h = stream(i, j, seed)
+        s1 = np.float64(h & np.uint64(0xFFFF)) / 65536.0
+        s2 = np.float64((h >> np.uint64(16)) & np.uint64(0xFFFF)) / 65536.0
+        s3 = np.float64((h >> np.uint64(32)) & np.uint64(0xFFFF)) / 65536.0
+        s4 = np.float64((h >> np.uint64(48)) & np.uint64(0xFFFF)) / 65536.0
+        n, m = normal[i], normal[j]
+        for k in range(counts[p]):
+            t = begin[p] + k + 0.5
+            place_on_pieces(corners, start, i, i + 1, area[i], (s1 + g1 * t) % 1.0, (s2 + g2 * t) % 1.0, x)
+            place_on_pieces(corners, start, j, j + 1, area[j], (s3 + g3 * t) % 1.0, (s4 + g4 * t) % 1.0, y)
+            dx, dy, dz = y[0] - x[0], y[1] - x[1], y[2] - x[2]
+            cx = dx * n[0] + dy * n[1] + dz * n[2]
+            cy = -(dx * m[0] + dy * m[1] + dz * m[2])
+            if cx <= 0.0 or cy <= 0.0:
+                continue
+            square = dx * dx + dy * dy + dz * dz
+            weights[row] = cx * cy / (square * square)
+            for axis in range(3):
+                a = x[axis] + offset * n[axis]
+                origins[row, axis] = (a - centre[axis]) * scale
+                directions[row, axis] = (y[axis] + offset * m[axis] - a) * scale
+            row += 1
+    starts[pairs.shape[0]] = row
+    return row
+
+
+@njit(nogil=True, cache=True)
+def _gather(starts, weights, blocked, sums):
+    """Add each pair's seen, whole and squared weights to ``sums`` (pairs, 3)."""
+    for p in range(starts.shape[0] - 1):
+        for k in range(starts[p], starts[p + 1]):
+            w = weights[k]
+            sums[p, 1] += w
+            sums[p, 2] += w * w
+            if blocked[k] != 0:
+                sums[p, 0] += w
+
+
+def _trace(pairs: IntArray, begin: IntArray, counts: IntArray, seed: int, pieces, tracer, sums: FloatArray) -> int:
+    """Trace the asked rays of every pair, block by block."""
+    centre, scale = tracer.frame
+    ends = np.cumsum(counts)
+    first = 0
+    traced = 0
+    while first < len(pairs):
+        last = max(first + 1, int(np.searchsorted(ends, ends[first] - counts[first] + BLOCK_RAYS, side="right")))
+        block = slice(first, last)
+        most = int(counts[block].sum())
+        starts = np.empty(last - first + 1, dtype=np.int64)
+        origins = np.empty((most, 3), dtype=np.float32)
+        directions = np.empty_like(origins)
+        weights = np.empty(most)
+        used = _pair_rays(
+            pairs[block], begin[block], counts[block], seed, pieces.corners, pieces.start, pieces.normal, pieces.area,
+            tracer.offset, centre, scale, starts, origins, directions, weights,
+        )  # fmt: skip
+        blocked = tracer.blocked_raw(origins[:used], directions[:used], np.ones(used, dtype=np.float32))
+        _gather(starts, weights, blocked, sums[block])
+        traced += used
+        first = last
+    return traced
+
+
+def _shares(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Visible share of each pair and its standard error."""
+    whole = np.where(sums[:, 1] > 0, sums[:, 1], 1.0)
+    share = np.where(sums[:, 1] > 0, sums[:, 0] / whole, 0.5)
+    effective = np.where(sums[:, 1] > 0, whole**2 / np.where(sums[:, 2] > 0, sums[:, 2], 1.0), 0.0)
+    # Two pseudo-rays, one of each kind, so that agreeing rays still leave a doubt.
+    safe = (share * effective + 1.0) / (effective + 2.0)
+    return share, np.sqrt(safe * (1.0 - safe) / (effective + 2.0))
+
+
+def ray_shares(
+    pairs: IntArray, goals: FloatArray, seed: int, pieces, tracer: EmbreeAccelerator
+) -> tuple[FloatArray, FloatArray, int]:
+    """Visible share of each pair of pieces by rays, its standard error, and the rays traced.
+
+    Parameters
+    ----------
+    pairs : (m, 2) int
+    goals : (m,) float
+        Wanted standard error of each share.
+    seed : int
+    pieces
+        Corners, start, normal and area of the pieces.
+    tracer : EmbreeAccelerator
+    """
+    sums = np.zeros((len(pairs), 3))
+    counts = np.full(len(pairs), FIRST_RAYS, dtype=np.int64)
+    begin = np.zeros(len(pairs), dtype=np.int64)
+    traced = _trace(pairs, begin, counts, seed, pieces, tracer, sums)
+    _, doubt = _shares(sums)
+    wanted = np.minimum((doubt / goals) ** 2 * FIRST_RAYS, MOST_RAYS)
+    more = np.flatnonzero(wanted > 1.5 * FIRST_RAYS)
+    if len(more):
+        extra = np.ceil(wanted[more]).astype(np.int64) - FIRST_RAYS
+        part = sums[more]
+        traced += _trace(
+            np.ascontiguousarray(pairs[more]), np.full(len(more), math.floor(FIRST_RAYS)), extra, seed, pieces, tracer,
+            part,
+        )  # fmt: skip
+        sums[more] = part
+    share, doubt = _shares(sums)
+    return share, doubt, traced

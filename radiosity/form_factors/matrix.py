@@ -1,0 +1,814 @@
+"""Matrices of form factors (view factors) between all surfaces or patches of a scene, with obstruction.
+
+The exchange area A_i F_ij of each pair is found once, so the matrix is reciprocal by construction; in a
+scene declared closed a symmetric scaling makes its rows sum to 1 without breaking that.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+from numba import njit
+from numpy.typing import NDArray
+
+from radiosity.form_factors import _pairs
+from radiosity.form_factors._ray_shares import ray_shares
+from radiosity.patches import PatchMesh, build_mesh, forecast_elements
+from workbench.accel.embree import EmbreeAccelerator
+from workbench.culling.shaft import MAX_SHAFT_PLANES
+from workbench.culling.tally import add_tally, new_tally
+from workbench.errors import InputError, OptionError
+from workbench.geometry.coplanar import Occluders, join_coplanar
+from workbench.geometry.flat import Geometry
+from workbench.geometry.polygons import plane_basis
+from workbench.memory import require_memory
+from workbench.record import RunRecord
+from workbench.scene.model import Scene
+
+__all__ = ["ViewFactors", "close_rows", "view_factors"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Matrix = Any
+"""A dense numpy array or a scipy.sparse.csr_array, (n, n)."""
+
+LEAF = 8
+"""Most pieces of a leaf of the tree of pairs."""
+STRIPE = 48
+"""Most pieces of a task: fixed, so that nothing depends on the number of workers."""
+COVERED = 0.01
+"""Share of a row of a closed scene that must be missing to count as covered (the floor under a box)."""
+ROUNDS = 200
+"""Most rounds of the scaling that closes rows."""
+DENSE_ENTRY, SPARSE_ENTRY = 12, 16
+"""Bytes of a value and its error, and of those with a column: the smaller whole decides."""
+CLOSED_TO = 1e-10
+"""Error of a row sum at which the scaling ends."""
+
+_TRIANGLE_3 = (np.array([[4.0, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6.0, np.full(3, 1.0 / 3.0))
+_A, _B = 0.445948490915965, 0.091576213509771
+_TRIANGLE_6 = (
+    np.array(
+        [
+            [1 - 2 * _A, _A, _A], [_A, 1 - 2 * _A, _A], [_A, _A, 1 - 2 * _A],
+            [1 - 2 * _B, _B, _B], [_B, 1 - 2 * _B, _B], [_B, _B, 1 - 2 * _B],
+        ]
+    ),
+    np.repeat([0.223381589678011, 0.109951743655322], 3),
+)  # fmt: skip
+"""D. A. Dunavant, "High degree efficient symmetrical Gaussian quadrature rules for the triangle" (1985)."""
+
+
+def _split_triangle(rule: tuple[FloatArray, FloatArray], level: int) -> tuple[FloatArray, FloatArray]:
+    """A rule of barycentric points on each of the ``4**level`` parts of a triangle."""
+    cells = [np.eye(3)]
+    for _ in range(level):
+        cells = [part for cell in cells for part in _quarters(cell)]
+    return np.concatenate([rule[0] @ cell for cell in cells]), np.tile(rule[1] / len(cells), len(cells))
+
+
+def _quarters(cell: FloatArray) -> list[FloatArray]:
+    a, b, c = cell
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    return [np.stack(part) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+
+
+def _gauss_square(points: int, cells: int) -> tuple[FloatArray, FloatArray]:
+    """A product Gauss rule on each of ``cells`` x ``cells`` parts of the unit square: (n, 2) and weights."""
+    x, w = np.polynomial.legendre.leggauss(points)
+    x = ((x[None] + 1.0) / 2.0 + np.arange(cells)[:, None]).ravel() / cells
+    w = np.tile(w / 2.0, cells) / cells
+    return np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2), np.outer(w, w).ravel()
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """Convex pieces in the order of a tree, with all that the kernels read of them."""
+
+    owner: IntArray
+    corners: FloatArray
+    start: IntArray
+    normal: FloatArray
+    offset: FloatArray
+    centroid: FloatArray
+    area: FloatArray
+    radius: FloatArray
+    low: FloatArray
+    high: FloatArray
+    group: IntArray
+    side: IntArray
+
+    @property
+    def count(self) -> int:
+        return len(self.area)
+
+
+def _rule_points(
+    pieces: _Pieces, triangle: tuple[FloatArray, FloatArray], square: tuple[FloatArray, FloatArray]
+) -> tuple[IntArray, FloatArray]:
+    """Weighted points (n, 4) of a rule on each piece, and where each piece's begin."""
+    sizes = np.diff(pieces.start)
+    fans = np.where(sizes == 4, 0, sizes - 2)
+    each = np.where(sizes == 4, len(square[1]), fans * len(triangle[1]))
+    start = np.concatenate([[0], np.cumsum(each)]).astype(np.int64)
+    out = np.empty((start[-1], 4))
+    quads = np.flatnonzero(sizes == 4)
+    if len(quads):
+        c = pieces.corners[pieces.start[quads][:, None] + np.arange(4)]
+        u, v = square[0][:, 0], square[0][:, 1]
+        shape = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=1)
+        along = (1 - v)[:, None] * (c[:, 1] - c[:, 0])[:, None] + v[:, None] * (c[:, 2] - c[:, 3])[:, None]
+        across = (1 - u)[:, None] * (c[:, 3] - c[:, 0])[:, None] + u[:, None] * (c[:, 2] - c[:, 1])[:, None]
+        row = start[quads][:, None] + np.arange(len(u))
+        out[row, :3] = shape @ c
+        out[row, 3] = square[1] * np.linalg.norm(np.cross(along, across), axis=2)
+    rest = np.flatnonzero(sizes != 4)
+    if len(rest):
+        which = np.repeat(rest, fans[rest])
+        step = np.arange(len(which)) - np.repeat(np.cumsum(fans[rest]) - fans[rest], fans[rest])
+        first = pieces.start[which]
+        c = pieces.corners[np.stack([first, first + step + 1, first + step + 2], axis=1)]
+        size = 0.5 * np.linalg.norm(np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), axis=1)
+        n = len(triangle[1])
+        row = (start[which] + step * n)[:, None] + np.arange(n)
+        out[row, :3] = triangle[0] @ c
+        out[row, 3] = triangle[1] * size[:, None]
+    return start, out
+
+
+def _mesh_pieces(mesh: PatchMesh, occluders: Occluders) -> _Pieces:
+    """The pieces of a mesh, in its order."""
+    start = mesh.piece_start
+    sizes = np.diff(start)
+    ring = np.repeat(np.arange(len(sizes)), sizes)
+    after = np.arange(len(mesh.corners)) + 1
+    after[start[1:] - 1] = start[:-1]
+    origin = mesh.corners[start[:-1]][ring]
+    part = 0.5 * np.cross(mesh.corners - origin, mesh.corners[after] - origin)
+    signed = np.einsum("ij,ij->i", part, mesh.piece_normal[ring])
+    area = np.bincount(ring, signed, len(sizes)).astype(np.float64)
+    middle = (origin + mesh.corners + mesh.corners[after]) / 3.0
+    centroid = (
+        np.stack([np.bincount(ring, signed * middle[:, k], len(sizes)) for k in range(3)], axis=1) / area[:, None]
+    )
+    away = np.linalg.norm(mesh.corners - centroid[ring], axis=1)
+    polygon = mesh.element_polygon[mesh.piece_element]
+    return _Pieces(
+        owner=mesh.piece_element,
+        corners=mesh.corners,
+        start=start,
+        normal=mesh.piece_normal,
+        offset=np.einsum("ij,ij->i", mesh.piece_normal, mesh.corners[start[:-1]]),
+        centroid=centroid,
+        area=area,
+        radius=np.maximum.reduceat(away, start[:-1]),
+        low=np.minimum.reduceat(mesh.corners, start[:-1]),
+        high=np.maximum.reduceat(mesh.corners, start[:-1]),
+        group=occluders.polygon_group[polygon],
+        side=np.where(np.einsum("ij,ij->i", mesh.piece_normal, _group_normals(mesh, occluders, polygon)) < 0, -1, 1),
+    )
+
+
+def _group_normals(mesh: PatchMesh, occluders: Occluders, polygon: IntArray) -> FloatArray:
+    """One normal a plane group, at each piece."""
+    normal = np.empty((int(occluders.polygon_group.max()) + 1, 3))
+    normal[occluders.polygon_group[polygon]] = mesh.piece_normal
+    return normal[occluders.polygon_group[polygon]]
+
+
+def _reordered(pieces: _Pieces, order: IntArray) -> _Pieces:
+    sizes = np.diff(pieces.start)[order]
+    start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    rows = np.arange(start[-1]) - np.repeat(start[:-1], sizes) + np.repeat(pieces.start[order], sizes)
+    rest = {
+        name: np.ascontiguousarray(getattr(pieces, name)[order])
+        for name in ("owner", "normal", "offset", "centroid", "area", "radius", "low", "high", "group", "side")
+    }
+    return _Pieces(corners=np.ascontiguousarray(pieces.corners[rows]), start=start, **rest)
+
+
+@dataclass(frozen=True)
+class _Tree:
+    """Nodes over ranges of pieces; ``group`` is -1 unless all pieces lie in one plane and face one way."""
+
+    first: IntArray
+    last: IntArray
+    left: IntArray
+    right: IntArray
+    low: FloatArray
+    high: FloatArray
+    group: IntArray
+    normal: FloatArray
+    offset: FloatArray
+    stripes: IntArray
+
+
+def _build_tree(pieces: _Pieces) -> tuple[_Tree, IntArray]:
+    """Tree over pieces, planes kept together as long as possible, and the order of its pieces."""
+    key = np.unique(np.stack([pieces.group, pieces.side], axis=1), axis=0, return_inverse=True)[1].ravel()
+    key = key.astype(np.int64)
+    # Centre of each plane's pieces, for the upper part of the tree.
+    count = np.bincount(key)
+    middle = np.stack([np.bincount(key, pieces.centroid[:, k]) / count for k in range(3)], axis=1)
+    nodes: list[list[int]] = []
+    order: list[IntArray] = []
+    stripes: list[int] = []
+    placed = 0
+    # Entries: pieces, parent's row and column to fill in, whether a stripe lies above.
+    stack: list[tuple[IntArray, int, int, bool]] = [(np.arange(pieces.count), -1, 0, False)]
+    while stack:
+        inside, parent, column, striped = stack.pop()
+        row = len(nodes)
+        if parent >= 0:
+            nodes[parent][column] = row
+        planes = key[inside]
+        single = bool((planes == planes[0]).all())
+        nodes.append([placed, placed + len(inside), -1, -1, int(inside[0]) if single else -1])
+        if not striped and len(inside) <= STRIPE:
+            stripes.append(row)
+            striped = True
+        if len(inside) <= LEAF:
+            order.append(inside)
+            placed += len(inside)
+            continue
+        place = pieces.centroid[inside] if single else middle[planes]
+        axis = int(np.argmax(np.ptp(place, axis=0)))
+        ranked = inside[np.lexsort((inside, planes, place[:, axis]))]
+        half = len(ranked) // 2
+        if not single:
+            # Cut between planes, not through one.
+            change = np.flatnonzero(np.diff(key[ranked])) + 1
+            half = int(change[np.argmin(np.abs(change - half))])
+        stack.append((ranked[half:], row, 3, striped))
+        stack.append((ranked[:half], row, 2, striped))
+    table = np.asarray(nodes, dtype=np.int64)
+    final = np.concatenate(order).astype(np.int64)
+    low, high = pieces.low[final], pieces.high[final]
+    node_low = np.stack([low[a:b].min(axis=0) for a, b in table[:, :2]])
+    node_high = np.stack([high[a:b].max(axis=0) for a, b in table[:, :2]])
+    lead = table[:, 4]
+    flat = lead >= 0
+    tree = _Tree(
+        first=table[:, 0].copy(),
+        last=table[:, 1].copy(),
+        left=table[:, 2].copy(),
+        right=table[:, 3].copy(),
+        low=node_low,
+        high=node_high,
+        group=np.where(flat, pieces.group[lead], -1),
+        normal=np.ascontiguousarray(np.where(flat[:, None], pieces.normal[lead], 0.0)),
+        offset=np.where(flat, pieces.offset[lead], 0.0),
+        stripes=np.asarray(stripes, dtype=np.int64),
+    )
+    return tree, final
+
+
+def _occluder_frames(occluders: Occluders) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of each occluder its plane's frame (origin, u, v), flat corners, and their lowest and highest (u, v)."""
+    count = occluders.count
+    frame = np.zeros((count, 9))
+    for k in range(count):
+        u, v = plane_basis(occluders.normal[k])
+        frame[k, 3:6], frame[k, 6:] = u, v
+    frame[:, :3] = occluders.corners[occluders.start[:-1]]
+    ring = np.repeat(np.arange(count), np.diff(occluders.start))
+    off = occluders.corners - frame[ring, :3]
+    flat = np.stack([np.einsum("ij,ij->i", off, frame[ring, 3:6]), np.einsum("ij,ij->i", off, frame[ring, 6:])], axis=1)
+    low = np.minimum.reduceat(flat, occluders.start[:-1]) if count else np.empty((0, 2))
+    high = np.maximum.reduceat(flat, occluders.start[:-1]) if count else np.empty((0, 2))
+    return frame, np.ascontiguousarray(flat), low, high
+
+
+@dataclass(frozen=True)
+class _Care:
+    """How the wanted error is spent."""
+
+    error: float
+    share_error: float
+    floor: float
+    levels: int
+    limit: int
+    reach: FloatArray
+
+    @classmethod
+    def for_error(cls, error: float, count: int) -> _Care:
+        """Settings for an L1 error of the rows: half of it for open exchanges, half for visible shares."""
+        relative = 0.5 * error
+        rules = (_pairs.POINT_RULE, 2.0), (_pairs.COARSE_RULE, 4.0), (_pairs.FINE_RULE, 5.6), (_pairs.LAMBERT_RULE, 5.6)
+        return cls(
+            error=relative,
+            # Pairs seen in part carry about a tenth of a row.
+            share_error=6.0 * error,
+            floor=1.0 / max(count, 1),
+            # Mean error of a share by rules of 3, 12, 48, ... points a triangle: 2.5 %, 0.6 %, 0.2 %, ...
+            levels=1 + sum(error < limit for limit in (1e-2, 3e-3, 4e-4, 5e-5)),
+            limit=min(12 if error > 5e-3 else 32, _pairs.MAX_CUT),
+            reach=np.array([(factor / relative) ** (1.0 / power) for factor, power in rules]),
+        )
+
+
+class _Engine:
+    """What the stripes of one matrix share: arrays, settings, threads' scratch."""
+
+    def __init__(self, mesh: PatchMesh, geometry: Geometry, care: _Care, seed: int) -> None:
+        self.occluders = join_coplanar(geometry)
+        pieces = _mesh_pieces(mesh, self.occluders)
+        self.tree, order = _build_tree(pieces)
+        self.pieces = _reordered(pieces, order)
+        self.care, self.seed = care, seed
+        self.geometry = geometry
+        self.tracer: EmbreeAccelerator | None = None
+        p, t, o = self.pieces, self.tree, self.occluders
+        frame, flat, flow, fhigh = _occluder_frames(o)
+        levels = [_rule_points(p, _split_triangle(_TRIANGLE_3, k), _gauss_square(2, 2**k)) for k in range(care.levels)]
+        ends = np.cumsum([0] + [len(points) for _, points in levels])
+        points = np.concatenate([points for _, points in levels])
+        level_starts = np.stack([start + end for (start, _), end in zip(levels, ends[:-1], strict=True)])
+        fine_start, fine = _rule_points(p, _TRIANGLE_6, _gauss_square(3, 1))
+        starts = o.start[:-1]
+        self._nodes = (t.first, t.last, t.left, t.right, t.low, t.high, t.group, t.normal, t.offset)
+        self._constant = (
+            p.corners, p.start, p.normal, p.offset, p.centroid, p.area, p.radius, p.low, p.high, p.group,
+            points, level_starts, fine, fine_start,
+            o.corners, o.start, o.normal, o.offset, o.group, o.through, frame, flat, flow, fhigh,
+            np.minimum.reduceat(o.corners, starts) if o.count else np.empty((0, 3)),
+            np.maximum.reduceat(o.corners, starts) if o.count else np.empty((0, 3)),
+            o.slack, care.error, care.share_error, care.floor, care.levels, care.reach, care.limit,
+        )  # fmt: skip
+        self._corners = int(max(np.diff(p.start).max(), np.diff(o.start).max(initial=3), 8))
+        self._idle: list[tuple[Any, ...]] = []
+
+    def _scratch(self) -> tuple[Any, ...]:
+        if self._idle:
+            return self._idle.pop()
+        widest = int((self.tree.last - self.tree.first)[self.tree.stripes].max())
+        return (
+            *_pairs.pair_workspace(self._corners),
+            np.empty((MAX_SHAFT_PLANES, 4)),
+            np.empty((16, 3)),
+            np.empty(96 * (self.occluders.count + 1), dtype=np.int64),
+            np.empty((1024, 4), dtype=np.int64),
+            np.empty((widest, self.pieces.count)),
+            np.empty((widest, self.pieces.count)),
+        )
+
+    def stripe(self, node: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray, NDArray[np.int64], int]:
+        """Pairs (i, j) of pieces that exchange, i < j, their exchange areas and errors; tally; rays."""
+        scratch = self._scratch()
+        try:
+            rows = int(self.tree.last[node] - self.tree.first[node])
+            out, spread = scratch[-2][:rows], scratch[-1][:rows]
+            out[:] = 0.0
+            spread[:] = 0.0
+            room = 4096
+            while True:
+                flagged = np.empty((room, 2), dtype=np.int64)
+                tally = new_tally()
+                flags = _pairs.stripe(node, *self._nodes, *self._constant, *scratch[:-2], out, spread, flagged, tally)
+                if flags <= room:
+                    break
+                room = int(flags)
+            traced = 0
+            base = int(self.tree.first[node])
+            if flags:
+                traced = self._by_rays(flagged[:flags], base, out, spread)
+            # A pair that no point saw may still exchange a little: its error stays.
+            i, j = np.nonzero(spread)
+            return i + base, j, out[i, j], spread[i, j], tally, traced
+        finally:
+            self._idle.append(scratch)
+
+    def _by_rays(self, pairs: IntArray, base: int, out: FloatArray, spread: FloatArray) -> int:
+        assert self.tracer is not None
+        whole = out[pairs[:, 0] - base, pairs[:, 1]]
+        smaller = np.minimum(self.pieces.area[pairs[:, 0]], self.pieces.area[pairs[:, 1]])
+        goals = self.care.share_error * (1.0 + self.care.floor * smaller / whole)
+        share, doubt, traced = ray_shares(pairs, goals, self.seed, self.pieces, self.tracer)
+        out[pairs[:, 0] - base, pairs[:, 1]] = whole * share
+        spread[pairs[:, 0] - base, pairs[:, 1]] = spread[pairs[:, 0] - base, pairs[:, 1]] * share + whole * doubt
+        return traced
+
+    def prepare_rays(self) -> None:
+        """Build Embree's tree before threads need it."""
+        self.tracer = EmbreeAccelerator(self.geometry)
+
+
+def _times_rows(matrix: Matrix, scale: FloatArray) -> Matrix:
+    """Each row of a matrix times a number, in place."""
+    if isinstance(matrix, np.ndarray):
+        matrix *= scale[:, None].astype(matrix.dtype)
+        return matrix
+    matrix.data *= np.repeat(scale, np.diff(matrix.indptr)).astype(matrix.dtype)
+    return matrix
+
+
+def close_rows(exchange: Matrix, wanted: FloatArray) -> FloatArray:
+    """Scale factors x so that ``x_i x_j S_ij`` has the wanted row sums; rows of nothing keep 1.
+
+    Symmetric scaling keeps reciprocity, zeros and signs (cf. J. van Leersum, "A method for determining a
+    consistent set of radiation view factors from a set generated by a nonexact method", Int. J. Heat Fluid
+    Flow 10(1), 1989, who corrects additively).
+
+    Parameters
+    ----------
+    exchange : (n, n) float, dense or sparse
+        Symmetric exchange areas A_i F_ij.
+    wanted : (n,) float
+        Row sums to reach: the areas, without what is covered of them.
+
+    Returns
+    -------
+    (n,) float
+    """
+    x = np.ones(len(wanted))
+    for _ in range(ROUNDS):
+        sums = x * (exchange @ x)
+        live = (sums > 0) & (wanted > 0)
+        ratio = np.divide(wanted, sums, out=np.ones(len(wanted)), where=live)
+        if np.abs(ratio - 1.0).max(initial=0.0) < CLOSED_TO:
+            break
+        x *= np.sqrt(ratio)
+    return x
+
+
+@dataclass(frozen=True)
+class ViewFactors:
+    """Form factors (view factors) between the surfaces or patches of a scene.
+
+    Parameters
+    ----------
+    matrix : (n, n) float, numpy array or scipy.sparse.csr_array
+        Row ``i`` holds F from ``i`` to each ``j``, the share of what leaves ``i`` that reaches ``j``.
+    standard_error : (n, n) float, of the same form
+        Estimated error of each entry: of its quadrature, its visible share and the closing of the rows.
+    areas : (n,) float
+        [scene lengths squared]
+    names : list of str
+    row_sums : (n,) float
+        Sums of the rows as found.
+    closure_correction : float
+        Largest change of an entry of F by closing the rows; 0 in open scenes.
+    reciprocity : float
+        Largest |A_i F_ij - A_j F_ji| over the largest exchange area.
+    record : RunRecord
+        Settings, seconds, counters and errors.
+    """
+
+    matrix: Matrix
+    standard_error: Matrix
+    areas: FloatArray
+    names: list[str]
+    row_sums: FloatArray
+    closure_correction: float
+    reciprocity: float
+    record: RunRecord
+
+    @property
+    def sparse(self) -> bool:
+        """Whether the matrix is stored sparse."""
+        return not isinstance(self.matrix, np.ndarray)
+
+    def dense(self) -> FloatArray:
+        """The matrix as a numpy array, (n, n)."""
+        return self.matrix if isinstance(self.matrix, np.ndarray) else self.matrix.toarray()
+
+    def save(self, path: str | Path) -> None:
+        """Write ``.npz`` (everything) or ``.csv`` (entries whose value or error is not 0), whole or not at all.
+
+        The npz holds ``areas``, ``names``, ``row_sums`` and either ``F`` and ``standard_error`` or their CSR
+        parts ``F_data``, ``F_indices``, ``F_indptr``, ``standard_error_data`` (the same places).  The csv has a
+        line an entry: ``from,to,F,standard_error``.
+
+        Raises
+        ------
+        InputError
+            If the suffix is another, or the file cannot be written.
+        """
+        path = Path(path)
+        if path.suffix not in (".npz", ".csv"):
+            raise InputError(f"{path}: found the suffix {path.suffix!r}, expected .npz or .csv")
+        beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+        try:
+            if path.suffix == ".npz":
+                self._write_npz(beside)
+            else:
+                self._write_csv(beside)
+            beside.replace(path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror or error}; give another file") from None
+        finally:
+            beside.unlink(missing_ok=True)
+
+    def _write_npz(self, path: Path) -> None:
+        parts: dict[str, Any] = {"areas": self.areas, "names": np.asarray(self.names), "row_sums": self.row_sums}
+        if isinstance(self.matrix, np.ndarray):
+            parts |= {"F": self.matrix, "standard_error": self.standard_error}
+        else:
+            assert not isinstance(self.standard_error, np.ndarray)
+            parts |= {
+                "F_data": self.matrix.data,
+                "F_indices": self.matrix.indices,
+                "F_indptr": self.matrix.indptr,
+                "standard_error_data": self.standard_error.data,
+            }
+        np.savez(path, **parts)
+
+    def _write_csv(self, path: Path) -> None:
+        quoted = ['"' + name.replace('"', '""') + '"' if set(name) & set(',"\n') else name for name in self.names]
+        with path.open("w", encoding="utf-8") as out:
+            out.write("from,to,F,standard_error\n")
+            for i, name in enumerate(quoted):
+                if isinstance(self.matrix, np.ndarray):
+                    row, error = self.matrix[i], self.standard_error[i]
+                    where = np.flatnonzero((row != 0) | (error != 0))
+                    values, errors = row[where], error[where]
+                else:
+                    a, b = self.matrix.indptr[i : i + 2]
+                    where, values = self.matrix.indices[a:b], self.matrix.data[a:b]
+                    errors = self.standard_error.data[a:b]
+                out.writelines(
+                    f"{name},{quoted[j]},{value:.12g},{error:.3g}\n"
+                    for j, value, error in zip(where.tolist(), values.tolist(), errors.tolist(), strict=True)
+                )
+
+
+def _names(mesh: PatchMesh, geometry: Geometry, by: str) -> tuple[IntArray, list[str]]:
+    """Row of each element, and the name of each row."""
+    back = mesh.element_side < 0
+    if by == "surface":
+        key = np.stack([mesh.element_surface, back], axis=1)
+        rows, owner = np.unique(key, axis=0, return_inverse=True)
+        names = [geometry.surface_name[s] + (" (back)" if b else "") for s, b in rows.tolist()]
+        return owner.ravel().astype(np.int64), names
+    polygon, surface = mesh.element_polygon, mesh.element_surface
+    faces = np.bincount(geometry.polygon_surface, minlength=len(geometry.surface_name))
+    parts = np.bincount(polygon[~back], minlength=geometry.polygon_count)
+    first = np.concatenate([[0], np.flatnonzero(np.diff(polygon) | np.diff(mesh.element_side)) + 1])
+    step = np.arange(len(polygon)) - np.repeat(first, np.diff(np.append(first, len(polygon))))
+    names = []
+    for e in range(len(polygon)):
+        name = geometry.surface_name[surface[e]]
+        if faces[surface[e]] > 1:
+            name += f"[{geometry.polygon_face[polygon[e]]}]"
+        if parts[polygon[e]] > 1:
+            name += f".{step[e]}"
+        names.append(name + (" (back)" if back[e] else ""))
+    return np.arange(len(polygon)), names
+
+
+def _facing_share(engine_pieces: _Pieces, seed: int) -> float:
+    """Share of pairs whose fronts have a point before each other: the most that can exchange."""
+    rng = np.random.default_rng(seed)
+    i, j = rng.integers(0, engine_pieces.count, (2, 4096))
+    c, n, r = engine_pieces.centroid, engine_pieces.normal, engine_pieces.radius
+    along = c[j] - c[i]
+    before = np.einsum("ij,ij->i", n[i], along) > -r[j]
+    return float((before & (np.einsum("ij,ij->i", n[j], along) < r[i])).mean())
+
+
+def _forecast(count: float, facing: float, workers: int) -> float:
+    """Bytes of the exchange areas as found, of the matrix with its errors, and of the threads' stripes."""
+    found = 0.5 * facing * count**2 * 24.0
+    kept = min(16.0, 24.0 * facing) * count**2
+    return found + kept + workers * 2.0 * STRIPE * count * 8.0
+
+
+Progress = Callable[[float], None]
+
+
+def view_factors(
+    scene: Scene,
+    *,
+    by: str = "patch",
+    error: float = 1e-3,
+    elements: int | None = None,
+    max_edge: float | None = None,
+    workers: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> ViewFactors:
+    """View factors between all surfaces or patches of a scene, with obstruction.
+
+    Parameters
+    ----------
+    scene : Scene
+    by : str
+        ``patch``: a row a polygon (or an element of it, see below); ``surface``: a row a surface, the
+        area-weighted mean over its polygons.  A two-sided surface has a row a side.
+    error : float
+        Wanted error: the mean over the rows of the sum of |F_ij - exact|.
+    elements, max_edge : optional
+        Divide the polygons first, as :func:`radiosity.solve` does.  Default: not at all.
+    workers : int, optional
+        Threads, all cores by default.  The answer does not depend on it.
+    seed : int
+        Of the rays, where rays decide.
+    progress : callable, optional
+        Called with the share done, 0 to 1.
+
+    Returns
+    -------
+    ViewFactors
+
+    Raises
+    ------
+    InputError, OptionError
+        If the scene has no surface or an option is out of its range.
+    MemoryForecastError
+        If the matrix would not fit in memory.
+
+    Notes
+    -----
+    Clear pairs get a closed form or a quadrature of that accuracy; pairs behind a few polygons are cut
+    exactly at the points of a rule (facets of one plane block as one polygon); only the rest gets rays.
+    In a scene declared closed rows are closed by a symmetric scaling, see :func:`close_rows`; a row that
+    lacks more than 1 % is covered by something and keeps what it has.
+    """
+    threads = workers if workers is not None else len(os.sched_getaffinity(0))
+    if by not in ("patch", "surface"):
+        raise OptionError(f"by: found {by!r}, expected 'patch' or 'surface'")
+    if not (math.isfinite(error) and 0 < error < 1):
+        raise OptionError(f"error: found {error}, expected a number between 0 and 1")
+    if threads < 1:
+        raise OptionError(f"workers: found {threads}, expected 1 or more")
+    where = str(scene.path) if scene.path is not None else scene.name
+    if not any(surface.face_count for surface in scene.surfaces):
+        raise InputError(f"{where}: found no surface; add a [[surface]] to the scene")
+    advice = "ask for fewer elements, a larger max_edge, or by='surface'"
+    count = float(forecast_elements(scene, max_edge or math.inf, 1)) if elements is None else float(elements)
+    require_memory(3000.0 * count, f"a mesh of {count:.3g} elements", advice)
+    record = RunRecord(
+        "viewfactors",
+        {
+            "scene": scene.name, "by": by, "error": error, "elements": elements, "max_edge": max_edge,
+            "workers": threads, "seed": seed,
+        },
+    )  # fmt: skip
+    with record.stage("mesh"):
+        geometry = Geometry.from_scene(scene)
+        mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=False)
+        row_of, names = _names(mesh, geometry, by)
+        areas = np.bincount(row_of, mesh.element_area, len(names)).astype(np.float64)
+    with record.stage("prepare"):
+        engine = _Engine(mesh, geometry, _Care.for_error(error, mesh.element_count), seed)
+        pieces = engine.pieces
+        n = pieces.count
+        needed = _forecast(len(names), _facing_share(pieces, seed), threads)
+        require_memory(needed, f"a matrix of {len(names)} x {len(names)} view factors", advice)
+        engine.prepare_rays()
+    with record.stage("exchange areas"):
+        exchange, spread = _all_exchanges(engine, row_of[pieces.owner], len(names), threads, record, progress)
+    with record.stage("close"):
+        found = _finished(scene, exchange, spread, areas, names, record)
+    record.results.update(rows=len(names), pieces=n, occluders=engine.occluders.count, sparse=found.sparse)
+    return found
+
+
+def _all_exchanges(
+    engine: _Engine, row_of: NDArray[Any], rows: int, threads: int, record: RunRecord, progress: Progress | None
+) -> tuple[Matrix, Matrix]:
+    """Symmetric exchange areas between rows and their errors, dense or sparse, whichever is smaller."""
+    tree, n = engine.tree, engine.pieces.count
+    merges = rows < n
+    parts: list[tuple[Any, ...]] = []
+    pool = ThreadPoolExecutor(threads)
+    done = 0.0
+    try:
+        stripes = tree.stripes.tolist()
+        for node, (i, j, value, error, tally, traced) in zip(stripes, pool.map(engine.stripe, stripes), strict=True):
+            add_tally(record.counters, tally)
+            record.counters.add(rays=traced)
+            low, high = np.minimum(row_of[i], row_of[j]), np.maximum(row_of[i], row_of[j])
+            if merges:
+                # Several pieces a row: add up what belongs together at once.
+                key, place = np.unique(low * rows + high, return_inverse=True)
+                place = place.ravel()
+                low, high = np.divmod(key, rows)
+                value = np.bincount(place, value, len(key)).astype(np.float64)
+                error = np.sqrt(np.bincount(place, error * error, len(key)))
+            parts.append((low.astype(np.int32), high.astype(np.int32), value, error.astype(np.float32)))
+            if progress is not None:
+                first, last = tree.first[node], tree.last[node]
+                done += float((last - first) * (2 * n - first - last)) / n**2
+                progress(min(done, 1.0))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    r, c, value, error = (np.concatenate([part[k] for part in parts]) for k in range(4))
+    parts.clear()
+    if merges:
+        both = scipy.sparse.coo_array((value, (r, c)), shape=(rows, rows)).tocsr()
+        doubt = scipy.sparse.coo_array((error.astype(np.float64) ** 2, (r, c)), shape=(rows, rows)).tocsr()
+        # On the diagonal both directions are one: the sum of both is twice the half.
+        exchange = scipy.sparse.csr_array(both + both.T)
+        spread = scipy.sparse.csr_array((doubt + doubt.T).sqrt())
+        if SPARSE_ENTRY * exchange.nnz >= DENSE_ENTRY * rows**2:
+            return exchange.toarray(), spread.toarray()
+        return exchange, spread
+    if SPARSE_ENTRY * 2 * len(value) >= DENSE_ENTRY * rows**2:
+        dense, dense_error = np.zeros((rows, rows)), np.zeros((rows, rows), dtype=np.float32)
+        _scatter(r, c, value, error, dense, dense_error)
+        return dense, dense_error
+    start = np.zeros(rows + 1, dtype=np.int64)
+    start[1:] = np.cumsum(np.bincount(r, minlength=rows) + np.bincount(c, minlength=rows))
+    column = np.empty(2 * len(value), dtype=np.int32)
+    data, errors = np.empty(len(column)), np.empty(len(column), dtype=np.float32)
+    order = np.argsort(r.astype(np.int64) * rows + c)
+    _symmetric_rows(r[order], c[order], value[order], error[order], start[:-1].copy(), column, data, errors)
+    if start[-1] < 2**31:
+        start = start.astype(np.int32)
+    exchange = scipy.sparse.csr_array((data, column, start), shape=(rows, rows))
+    exchange.has_sorted_indices = True
+    spread = scipy.sparse.csr_array((errors, column, start), shape=(rows, rows))
+    spread.has_sorted_indices = True
+    return exchange, spread
+
+
+@njit(nogil=True, cache=True)
+def _scatter(r, c, value, error, dense, dense_error):
+    """Write each pair to both of its places."""
+    for k in range(r.shape[0]):
+        dense[r[k], c[k]] = value[k]
+        dense[c[k], r[k]] = value[k]
+        dense_error[r[k], c[k]] = error[k]
+        dense_error[c[k], r[k]] = error[k]
+
+
+@njit(nogil=True, cache=True)
+def _symmetric_rows(r, c, value, error, place, column, data, errors):
+    """Fill the rows of a symmetric CSR matrix, columns ascending, from pairs r < c sorted by (r, c)."""
+    # Below the diagonal first: row c gets its columns r in ascending order of r.
+    for k in range(r.shape[0]):
+        p = place[c[k]]
+        column[p], data[p], errors[p] = r[k], value[k], error[k]
+        place[c[k]] = p + 1
+    for k in range(r.shape[0]):
+        p = place[r[k]]
+        column[p], data[p], errors[p] = c[k], value[k], error[k]
+        place[r[k]] = p + 1
+
+
+def _finished(
+    scene: Scene, exchange: Matrix, spread: Matrix, areas: FloatArray, names: list[str], record: RunRecord
+) -> ViewFactors:
+    """Close the rows of an enclosure, divide by the areas, and say how good it is."""
+    sums = np.asarray(exchange.sum(axis=1)).ravel() / areas
+    stated = np.asarray(spread.sum(axis=1)).ravel() / areas
+    correction = 0.0
+    if scene.closed:
+        covered = 1.0 - sums > np.maximum(stated, COVERED)
+        x = close_rows(exchange, np.where(covered, sums * areas, areas))
+        if isinstance(exchange, np.ndarray):
+            change = 0.0
+            for first in range(0, len(areas), 256):
+                rows = slice(first, first + 256)
+                scale = x[rows, None] * x[None, :] - 1.0
+                moved = np.abs(scale * exchange[rows])
+                change = max(change, float((moved / areas[rows, None]).max()))
+                spread[rows] = np.hypot(spread[rows], moved)
+                exchange[rows] *= scale + 1.0
+            correction = change
+        else:
+            row = np.repeat(np.arange(len(areas)), np.diff(exchange.indptr))
+            scale = x[row] * x[exchange.indices]
+            moved = np.abs((scale - 1.0) * exchange.data)
+            correction = float((moved / areas[row]).max(initial=0.0))
+            spread.data[:] = np.hypot(spread.data, moved)
+            exchange.data *= scale
+        record.results["covered_rows"] = int(covered.sum())
+    largest = float(exchange.max()) if len(areas) else 0.0
+    matrix = _times_rows(exchange, 1.0 / areas)
+    errors = _times_rows(spread, 1.0 / areas)
+    back = _asymmetry(matrix, areas) / max(largest, 1e-300)
+    closed_sums = np.asarray(matrix.sum(axis=1)).ravel()
+    record.errors.update(
+        row_sum_as_found={"min": float(sums.min()), "mean": float(sums.mean()), "max": float(sums.max())},
+        row_sum={"min": float(closed_sums.min()), "mean": float(closed_sums.mean()), "max": float(closed_sums.max())},
+        closure_correction=correction,
+        reciprocity=back,
+        stated_row_error=float(np.asarray(errors.sum(axis=1)).mean()),
+    )
+    return ViewFactors(matrix, errors, areas, names, sums, correction, back, record)
+
+
+def _asymmetry(matrix: Matrix, areas: FloatArray) -> float:
+    """Largest |A_i F_ij - A_j F_ji|."""
+    if isinstance(matrix, np.ndarray):
+        worst = 0.0
+        for first in range(0, len(areas), 256):
+            rows = slice(first, first + 256)
+            worst = max(
+                worst, float(np.abs(areas[rows, None] * matrix[rows] - (areas[:, None] * matrix[:, rows]).T).max())
+            )
+        return worst
+    row = np.repeat(np.arange(len(areas)), np.diff(matrix.indptr))
+    # The pattern is symmetric, so the transpose as CSR has its entries in the same places.
+    back = matrix.T.tocsr().data * areas[matrix.indices]
+    return float(np.abs(matrix.data * areas[row] - back).max(initial=0.0))

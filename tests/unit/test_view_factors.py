@@ -1,0 +1,206 @@
+"""View-factor matrices: reciprocity, closing, sparse and dense, honest errors, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radiosity_scenes import UNIT, each_truth, polygon_scene, truth
+from view_factor_scenes import closed_room
+
+import radiosity
+from radiosity.form_factors import matrix
+from radiosity.form_factors.matrix import close_rows
+from workbench.errors import InputError, MemoryForecastError, OptionError
+from workbench.scene.library import box_surface, diffuse
+from workbench.scene.model import Scene, Surface
+
+
+@pytest.fixture(scope="module")
+def room():
+    return closed_room(0.8)
+
+
+@pytest.fixture(scope="module")
+def found(room):
+    return radiosity.view_factors(room, error=1e-3, workers=2)
+
+
+@pytest.fixture(scope="module")
+def reference(room):
+    return radiosity.view_factors(room, error=2e-5, workers=2)
+
+
+def errors_of(found):
+    return found.standard_error if not found.sparse else found.standard_error.toarray()
+
+
+def test_rows_close_without_breaking_reciprocity(found):
+    factor = found.dense()
+    exchange = found.areas[:, None] * factor
+    assert np.abs(exchange - exchange.T).max() <= 1e-15 * exchange.max()
+    assert found.reciprocity < 1e-14
+    assert np.abs(factor.sum(axis=1) - 1).max() < 1e-9
+    assert np.abs(found.row_sums - 1).max() < 3e-3  # as found, before closing
+    assert 0 < found.closure_correction < 1e-3
+    assert (factor >= 0).all() and (np.diag(factor) == 0).all()
+
+
+def test_the_wanted_error_is_met_and_stated(found, reference):
+    off = np.abs(found.dense() - reference.dense())
+    assert off.sum(axis=1).mean() < 1e-3
+    stated = errors_of(found)
+    assert 0.5 * off.sum(axis=1).mean() < stated.sum(axis=1).mean() < 10 * off.sum(axis=1).mean()
+    # The reference's own error beside ours; one in a hundred may lie beyond three.
+    allowed = 3 * np.hypot(stated, errors_of(reference)) + 1e-9
+    assert (off > allowed).mean() < 0.01
+
+
+def test_the_number_of_workers_changes_nothing(room, found):
+    again = radiosity.view_factors(room, error=1e-3, workers=1)
+    assert (again.dense() == found.dense()).all()
+    assert dict(again.record.counters) == dict(found.record.counters)
+
+
+def test_sparse_equals_dense(room, found, monkeypatch):
+    monkeypatch.setattr(matrix, "SPARSE_ENTRY", 0 if not found.sparse else 10**6)
+    other = radiosity.view_factors(room, error=1e-3, workers=2)
+    assert other.sparse != found.sparse
+    assert other.dense() == pytest.approx(found.dense(), rel=1e-12, abs=0)
+    assert errors_of(other) == pytest.approx(errors_of(found), rel=1e-6, abs=0)
+    assert other.reciprocity < 1e-14
+
+
+def test_surfaces_are_the_area_weighted_sum_of_their_polygons(room, found):
+    by = radiosity.view_factors(room, by="surface", error=1e-3, workers=2)
+    assert by.names == [surface.name for surface in room.surfaces]
+    owner = np.repeat(np.arange(len(by.names)), [surface.face_count for surface in room.surfaces])
+    exchange = np.zeros((len(by.names), len(by.names)))
+    np.add.at(exchange, (owner[:, None], owner[None, :]), found.areas[:, None] * found.dense())
+    assert by.areas == pytest.approx(np.bincount(owner, found.areas))
+    # Closed on surfaces there, on polygons here.
+    assert by.areas[:, None] * by.dense() == pytest.approx(exchange, abs=3e-4 * by.areas.max())
+    assert np.abs(by.dense().sum(axis=1) - 1).max() < 1e-9
+
+
+def test_an_open_scene_is_not_closed():
+    one, two = truth_squares()
+    found = radiosity.view_factors(polygon_scene(one, two), error=1e-6)
+    # Howell C-11 for unit squares a unit apart.
+    assert found.dense() == pytest.approx(np.array([[0, 0.19982489569838746], [0.19982489569838746, 0]]), abs=1e-8)
+    assert found.closure_correction == 0
+
+
+def truth_squares():
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    return square, square[::-1] + [0, 0, 1]
+
+
+def test_covered_floor_keeps_what_it_sees():
+    # A box stands on the undivided floor: the floor's row lacks the covered share, and keeps it so.
+    room = box_surface("room", diffuse("wall", 0.5), *UNIT, inward=True)
+    box = box_surface("box", diffuse("box", 0.5), [0.25, 0.25, 0], [0.75, 0.75, 0.5], omit=["-z"])
+    found = radiosity.view_factors(Scene("covered", (room, box), bands=1, closed=True), error=1e-3)
+    assert found.record.results["covered_rows"] == 1
+    sums = found.dense().sum(axis=1)
+    floor = [i for i, s in enumerate(sums) if s < 0.99]
+    assert len(floor) == 1 and sums[floor[0]] == pytest.approx(0.75, abs=2e-3)
+    assert np.abs(np.delete(sums, floor[0]) - 1).max() < 1e-6
+
+
+def test_coplanar_elements_and_two_sides_of_a_sheet_exchange_nothing():
+    sheet = Surface.from_polygons(
+        "sheet", diffuse("s", 0.5), [np.array([[0, 0, 0.5], [1, 0, 0.5], [1, 1, 0.5], [0, 1, 0.5]])]
+    )
+    back = Surface.from_polygons("back", diffuse("b", 0.5), [sheet.face(0)[0][::-1]])
+    room = box_surface("room", diffuse("wall", 0.5), [-1, -1, -1], [2, 2, 2], inward=True)
+    found = radiosity.view_factors(Scene("sheet", (room, sheet, back), bands=1, closed=True), max_edge=0.6, error=5e-3)
+    rows = [i for i, name in enumerate(found.names) if name.startswith(("sheet", "back"))]
+    assert (found.dense()[np.ix_(rows, rows)] == 0).all()
+    assert np.abs(found.row_sums - 1).max() < 0.03
+
+
+def test_long_candidate_lists_get_rays(monkeypatch):
+    monkeypatch.setattr(matrix._pairs, "MAX_CUT", 1)
+    room = closed_room(1.5)
+    by_rays = radiosity.view_factors(room, error=3e-3)
+    monkeypatch.undo()
+    exact = radiosity.view_factors(room, error=1e-4)
+    assert by_rays.record.counters["rays"] > 0 and exact.record.counters["rays"] == 0
+    off, stated = by_rays.dense() - exact.dense(), np.hypot(errors_of(by_rays), errors_of(exact))
+    assert np.abs(off).sum(axis=1).mean() < 3e-2
+    # One standard error: the z values of the entries that are seen in part.
+    z = off[stated > 1e-5] / stated[stated > 1e-5]
+    assert len(z) > 50 and np.sqrt((z**2).mean()) < 1.5
+
+
+@each_truth("occ/L-room/")
+def test_l_room(name):
+    import workbench
+
+    found = radiosity.view_factors(workbench.load("l-room"), error=1e-4)
+    assert found.dense() == pytest.approx(np.array(truth(name)["value"]), abs=1e-4)
+    assert (found.dense()[np.array(truth(name)["value"]) == 0] == 0).all()
+
+
+def test_closing_keeps_symmetry_zeros_and_rows_of_nothing():
+    exchange = np.array([[0, 2.0, 1.0, 0], [2.0, 0, 1.1, 0], [1.0, 1.1, 0, 0], [0, 0, 0, 0]])
+    wanted = np.array([3.05, 3.0, 2.2, 1.0])
+    x = close_rows(exchange, wanted)
+    closed = exchange * x * x[:, None]
+    assert closed.sum(axis=1)[:3] == pytest.approx(wanted[:3], rel=1e-8)
+    assert x[3] == 1 and ((closed == 0) == (exchange == 0)).all()
+
+
+def test_names_say_surface_face_and_part():
+    square, _ = truth_squares()
+    surfaces = (
+        Surface.from_polygons("one", diffuse("a", 0.5), [square]),
+        Surface.from_polygons("two", diffuse("a", 0.5), [square + [0, 0, 1], square + [2, 0, 1]]),
+    )
+    scene = Scene("names", surfaces, bands=1)
+    assert radiosity.view_factors(scene).names == ["one", "two[0]", "two[1]"]
+    names = radiosity.view_factors(scene, max_edge=0.5).names
+    assert names[:4] == ["one.0", "one.1", "one.2", "one.3"] and names[4] == "two[0].0"
+
+
+def test_files_hold_the_matrix(found, tmp_path):
+    found.save(tmp_path / "F.npz")
+    with np.load(tmp_path / "F.npz") as stored:
+        assert (stored["areas"] == found.areas).all() and stored["names"].tolist() == found.names
+        if "F" in stored:
+            assert (stored["F"] == found.dense()).all()
+        else:
+            import scipy.sparse
+
+            n = len(found.names)
+            parts = stored["F_data"], stored["F_indices"], stored["F_indptr"]
+            assert (scipy.sparse.csr_array(parts, shape=(n, n)).toarray() == found.dense()).all()
+    found.save(tmp_path / "F.csv")
+    lines = (tmp_path / "F.csv").read_text().splitlines()
+    assert lines[0] == "from,to,F,standard_error"
+    assert len(lines) == 1 + np.count_nonzero((found.dense() != 0) | (errors_of(found) != 0))
+    with pytest.raises(InputError, match=r"expected \.npz or \.csv"):
+        found.save(tmp_path / "F.txt")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["F.csv", "F.npz"]
+
+
+@pytest.mark.parametrize(
+    "options", [{"by": "room"}, {"error": 0.0}, {"error": 2.0}, {"error": float("nan")}, {"workers": 0}]
+)
+def test_bad_options_are_refused(options):
+    with pytest.raises(OptionError, match=next(iter(options))):
+        radiosity.view_factors(polygon_scene(*truth_squares()), **options)
+
+
+def test_a_scene_without_surface_is_refused():
+    with pytest.raises(InputError, match="no surface"):
+        radiosity.view_factors(Scene("empty", ()))
+
+
+def test_too_large_a_matrix_is_refused_with_its_size(monkeypatch):
+    # A million rows: 16 bytes and more for each of a million million pairs, in any machine too much.
+    with pytest.raises(MemoryForecastError, match="GiB"):
+        radiosity.view_factors(polygon_scene(*truth_squares()), elements=10**9)
+    monkeypatch.setattr("workbench.memory.available_bytes", lambda: 1000)
+    with pytest.raises(MemoryForecastError, match=r"2 x 2 view factors|mesh of"):
+        radiosity.view_factors(polygon_scene(*truth_squares()))
