@@ -17,7 +17,7 @@ from numba import njit
 from radiosity.form_factors._contour import CONTOUR_ROWS, contour_integral_in
 from radiosity.form_factors.analytic import _clip_pair
 from workbench.culling.plane_vertex import outside_planes
-from workbench.culling.shaft import box_shaft_in
+from workbench.culling.shaft import box_shaft
 from workbench.culling.tally import (
     CLEAR,
     CLOSED,
@@ -683,7 +683,7 @@ def node_candidates(
                 tally[SHAFT_CULL] += 1
                 continue
         if used < 0:
-            used = box_shaft_in(node_low[a], node_high[a], node_low[b], node_high[b], shaft, points)
+            used = box_shaft(node_low[a], node_high[a], node_low[b], node_high[b], shaft)
             # What only touches the shaft from outside hides a null set.
             for p in range(used):
                 shaft[p, 3] += 2.0 * slack

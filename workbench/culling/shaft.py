@@ -23,12 +23,6 @@ MAX_SHAFT_PLANES = 6 + 12 + 2
 @njit(nogil=True, cache=True)
 def box_shaft(alow, ahigh, blow, bhigh, planes):
     """Planes (nx, ny, nz, d), inside ``n . x >= d``, of the shaft between two boxes; their number."""
-    return box_shaft_in(alow, ahigh, blow, bhigh, planes, np.empty((8, 2)))
-
-
-@njit(nogil=True, cache=True)
-def box_shaft_in(alow, ahigh, blow, bhigh, planes, corner):
-    """:func:`box_shaft` with its scratch, (8, 2)."""
     used = 0
     size = 0.0
     for axis in range(3):
@@ -43,23 +37,21 @@ def box_shaft_in(alow, ahigh, blow, bhigh, planes, corner):
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         for c in range(4):
-            corner[c, 0] = ahigh[u] if c & 1 else alow[u]
-            corner[c, 1] = ahigh[v] if c & 2 else alow[v]
-            corner[c + 4, 0] = bhigh[u] if c & 1 else blow[u]
-            corner[c + 4, 1] = bhigh[v] if c & 2 else blow[v]
-        for c in range(4):
-            du, dv = corner[c + 4, 0] - corner[c, 0], corner[c + 4, 1] - corner[c, 1]
+            # A corner of a and the same corner of b, seen along the axis.
+            au, av = ahigh[u] if c & 1 else alow[u], ahigh[v] if c & 2 else alow[v]
+            du, dv = (bhigh[u] if c & 1 else blow[u]) - au, (bhigh[v] if c & 2 else blow[v]) - av
             length = math.sqrt(du * du + dv * dv)
             # An axis-aligned link is a side of the union box, which is there already.
             if du == 0.0 or dv == 0.0 or length <= 1e-9 * size:
                 continue
             pu, pv = -dv / length, du / length
-            d = pu * corner[c, 0] + pv * corner[c, 1]
+            d = pu * au + pv * av
             lowest, highest = 0.0, 0.0
-            for k in range(8):
-                off = pu * corner[k, 0] + pv * corner[k, 1] - d
-                lowest = min(lowest, off)
-                highest = max(highest, off)
+            for k in range(4):
+                off_a = pu * (ahigh[u] if k & 1 else alow[u]) + pv * (ahigh[v] if k & 2 else alow[v]) - d
+                off_b = pu * (bhigh[u] if k & 1 else blow[u]) + pv * (bhigh[v] if k & 2 else blow[v]) - d
+                lowest = min(lowest, off_a, off_b)
+                highest = max(highest, off_a, off_b)
             if lowest < -1e-12 * size and highest > 1e-12 * size:
                 continue
             if lowest < -1e-12 * size:
