@@ -26,6 +26,7 @@ from radiosity.irradiance_command import irradiance
 from radiosity.render_command import render
 from radiosity.reproduce import REPRODUCTIONS
 from radiosity.shadow_command import shadow
+from radiosity.stability_command import stability
 from radiosity.viewfactors_command import viewfactors
 from workbench.errors import InputError, OptionError, WorkbenchError
 
@@ -428,6 +429,7 @@ main.add_command(shadow)
 main.add_command(irradiance)
 main.add_command(chart)
 main.add_command(viewfactors)
+main.add_command(stability)
 
 
 # ---- view, scenes, doctor ---------------------------------------------------------------------

@@ -25,8 +25,11 @@ __all__ = ["BLOCK_RAYS", "EmbreeAccelerator"]
 BLOCK_RAYS = 32768
 """Rays a block: small enough to stay in cache, large enough to hide the call."""
 
-OFFSET = 2e-6
-"""Distance by which ends of rays are moved off surfaces, as a share of the scene's size."""
+OFFSET = 5e-7
+"""Distance by which ends of rays are moved off surfaces, as a share of the scene's size.
+
+What lies nearer to a surface than that does not shadow it.  From 6e-8 down rays begin to hit the
+surface that they leave (of 200 tilted triangles, once in 100,000)."""
 
 
 class EmbreeAccelerator:

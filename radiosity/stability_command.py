@@ -1,0 +1,227 @@
+"""The command ``radiosity stability``: the catalogue of failures, every technique, and what became of each.
+
+Only ``click`` is imported at the top; everything heavy is imported when the command runs.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from workbench.errors import InputError, OptionError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from matplotlib.figure import Figure
+
+    from radiosity.report.failures import Cell, Failure
+
+__all__ = ["draw_matrix", "run_catalogue", "stability"]
+
+VERDICTS = {
+    "right": "#7fc97f", "degrades": "#fdd49e", "refuses": "#9ecae1", "disclaims": "#bdbdbd", "wrong": "#d7301f",
+}  # fmt: skip
+"""Verdicts with the colours of their cells."""
+
+
+@click.command()
+@click.option("-o", "--output", "directory", type=click.Path(path_type=Path), metavar="DIR", help="Write files here.")
+@click.option("--only", metavar="NAME", help="Entries, groups or techniques whose name holds NAME.")
+@click.option("--list", "listing", is_flag=True, help="List the catalogue and run nothing.")
+def stability(directory: Path | None, only: str | None, listing: bool) -> None:
+    """Run every technique on the scenes where such techniques fail.
+
+    Prints a matrix of failures by techniques.  A cell is "right"; or "degrades", with its relative error,
+    where the technique's own stated error covers it; or "refuses", with a reason; or "disclaims", where
+    its documentation names the case; or "WRONG".  DIR gets stability.csv, stability.png and
+    record.json.  The exit code is 1 if any cell is wrong.
+    """
+    from radiosity.report.failures import CATALOGUE
+    from radiosity.shadow_command import _check_folder
+
+    chosen = _chosen(CATALOGUE, only)
+    if listing:
+        for entry, _ in chosen:
+            click.echo(f"{entry.group:30s} {entry.name:36s} {entry.about}")
+        return
+    _check_folder(directory)
+    from workbench.record import RunRecord
+    from workbench.study.result import format_table
+
+    record = RunRecord("stability", settings={"only": only})
+    with record.stage("catalogue"):
+        matrix = run_catalogue(chosen)
+    click.echo(format_table(_rows(chosen, matrix)))
+    click.echo()
+    for line in _reasons(chosen, matrix):
+        click.echo(line)
+    counts = {verdict: sum(cell.verdict == verdict for cell in matrix.values()) for verdict in VERDICTS}
+    click.echo(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+    if directory is not None:
+        record.results = {"counts": counts, "cells": _table(chosen, matrix)}
+        _write(directory, chosen, matrix, record)
+    if counts["wrong"]:
+        raise SystemExit(1)
+
+
+def _chosen(catalogue: Sequence[Failure], only: str | None) -> list[tuple[Failure, list[str]]]:
+    """Entries and the techniques to run on each."""
+    chosen = []
+    for entry in catalogue:
+        whole = only is None or only in entry.name or only in entry.group
+        techniques = [name for name in entry.techniques if whole or only == name]
+        if techniques:
+            chosen.append((entry, techniques))
+    if not chosen:
+        raise OptionError(f"--only: found {only!r}, expected part of a name that 'radiosity stability --list' shows")
+    return chosen
+
+
+def run_catalogue(chosen: Sequence[tuple[Failure, Sequence[str]]]) -> dict[tuple[str, str], Cell]:
+    """What became of each technique (second key) on each entry (first key)."""
+    from tqdm import tqdm
+
+    from radiosity.report.failures import judge
+
+    tasks = [(entry, technique) for entry, techniques in chosen for technique in techniques]
+    return {
+        (entry.name, technique): judge(entry, technique) for entry, technique in tqdm(tasks, disable=None, leave=False)
+    }
+
+
+def _text(cell: Cell | None) -> str:
+    if cell is None:
+        return ""
+    if cell.verdict in ("right", "refuses"):
+        return cell.verdict
+    size = abs(cell.error)
+    error = f"{100 * size:.2g}%" if math.isfinite(size) else f"{size}"
+    return {"degrades": f"degrades {error}", "disclaims": f"disclaims {error}"}.get(cell.verdict, f"WRONG {error}")
+
+
+def _columns(chosen: Sequence[tuple[Failure, Sequence[str]]]) -> list[str]:
+    """Techniques, those that answer the same questions side by side."""
+    families: dict[tuple[str, ...], None] = dict.fromkeys(tuple(entry.techniques) for entry, _ in chosen)
+    asked = {technique for _, techniques in chosen for technique in techniques}
+    ordered = sorted(families, key=len, reverse=True)
+    return [name for name in dict.fromkeys(n for family in ordered for n in family) if name in asked]
+
+
+def _rows(
+    chosen: Sequence[tuple[Failure, Sequence[str]]], matrix: Mapping[tuple[str, str], Cell]
+) -> list[dict[str, str]]:
+    """The matrix in short: techniques that agree on an entry share its cell."""
+    rows = []
+    for entry, techniques in chosen:
+        groups: dict[str, list[str]] = {}
+        for technique in techniques:
+            groups.setdefault(_text(matrix[entry.name, technique]), []).append(technique)
+        most = max(groups, key=lambda text: (text == "right", len(groups[text])))
+        rest = [f"{', '.join(names)}: {text}" for text, names in groups.items() if text != most]
+        told = f"{'all' if len(groups) == 1 else len(groups[most])} {most}"
+        rows.append({"group": entry.group, "failure": entry.name, "techniques": "; ".join([told, *rest])})
+    return rows
+
+
+def _reasons(chosen: Sequence[tuple[Failure, Sequence[str]]], matrix: Mapping[tuple[str, str], Cell]) -> list[str]:
+    """Why techniques refused, each reason once."""
+    found: dict[str, list[str]] = {}
+    for entry, techniques in chosen:
+        for technique in techniques:
+            cell = matrix[entry.name, technique]
+            if cell.reason:
+                found.setdefault(f"{cell.verdict}: {cell.reason}", []).append(f"{technique} on {entry.name!r}")
+    return [f"{reason} ({'; '.join(names)})" for reason, names in found.items()]
+
+
+def _table(
+    chosen: Sequence[tuple[Failure, Sequence[str]]], matrix: Mapping[tuple[str, str], Cell]
+) -> list[dict[str, Any]]:
+    return [
+        {
+            "group": entry.group, "failure": entry.name, "about": entry.about, "expected": entry.expected,
+            "technique": technique, "verdict": cell.verdict, "relative_error": cell.error,
+            "relative_stated_error": cell.stated, "reason": cell.reason,
+        }
+        for entry, techniques in chosen for technique in techniques for cell in [matrix[entry.name, technique]]
+    ]  # fmt: skip
+
+
+def _write(
+    directory: Path,
+    chosen: Sequence[tuple[Failure, Sequence[str]]],
+    matrix: Mapping[tuple[str, str], Cell],
+    record: Any,
+) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from workbench.record import write_text_atomically
+
+    cells = _table(chosen, matrix)
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(cells[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(cells)
+    figure = Figure(layout="constrained")
+    FigureCanvasAgg(figure)
+    draw_matrix(figure, chosen, matrix)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        write_text_atomically(directory / "stability.csv", table.getvalue())
+        beside = directory / f".stability.{os.getpid()}.part"
+        figure.savefig(beside, format="png", dpi=100)
+        beside.replace(directory / "stability.png")
+        record.write(directory / "record.json")
+    except OSError as error:
+        raise InputError(f"{directory}: cannot write here: {error.strerror or error}; give another folder") from None
+    for name in ("stability.csv", "stability.png", "record.json"):
+        click.echo(str(directory / name))
+
+
+def draw_matrix(
+    figure: Figure, chosen: Sequence[tuple[Failure, Sequence[str]]], matrix: Mapping[tuple[str, str], Cell]
+) -> None:
+    """Failures down, techniques across, a coloured cell for each pair, into an empty figure."""
+    from matplotlib.patches import Patch, Rectangle
+
+    columns = _columns(chosen)
+    figure.set_size_inches(4.6 + 0.62 * len(columns), 1.9 + 0.27 * len(chosen))
+    axes = figure.subplots()
+    before = None
+    for row, (entry, techniques) in enumerate(chosen):
+        if entry.group != before:
+            axes.axhline(row, color="0.35", lw=0.8)
+            axes.text(len(columns) + 0.15, row + 0.5, entry.group, va="center", fontsize=8, color="0.3", style="italic")
+            before = entry.group
+        for technique in techniques:
+            cell = matrix[entry.name, technique]
+            column = columns.index(technique)
+            colour = VERDICTS[cell.verdict]
+            axes.add_patch(Rectangle((column, row), 1, 1, facecolor=colour, edgecolor="white", lw=1))
+            if cell.verdict in ("degrades", "disclaims", "wrong") and math.isfinite(cell.error):
+                size = 100 * abs(cell.error)
+                text = f"{size:.2g}%" if size < 99.5 else f"{size:.0f}%"
+                axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=7)
+    axes.set_xlim(0, len(columns))
+    axes.set_ylim(len(chosen), 0)
+    axes.set_yticks([row + 0.5 for row in range(len(chosen))], [entry.name for entry, _ in chosen], fontsize=8)
+    axes.set_xticks([i + 0.5 for i in range(len(columns))], columns, rotation=50, ha="left", fontsize=8)
+    axes.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    wrong = sum(cell.verdict == "wrong" for cell in matrix.values())
+    words = {"right": "right", "degrades": "degrades, and says so: error", "refuses": "refuses, with a reason",
+             "disclaims": "disclaimed in its documentation: error", "wrong": f"wrong silently ({wrong})"}  # fmt: skip
+    axes.legend(
+        handles=[Patch(facecolor=VERDICTS[verdict], label=text) for verdict, text in words.items()],
+        loc="upper left", bbox_to_anchor=(0.0, -0.01), ncols=3, fontsize=8, frameon=False,
+    )  # fmt: skip
+    figure.suptitle("Where techniques of light transport fail, and what became of each", fontsize=11)
