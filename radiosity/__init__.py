@@ -16,30 +16,35 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from radiosity.accuracy import solve
     from radiosity.form_factors.matrix import ViewFactors, view_factors
+    from radiosity.form_factors.pair import FormFactor, form_factor
     from radiosity.patches import PatchMesh
     from radiosity.sensors import Gatherer, IrradianceEstimate
     from radiosity.solvers.solution import ProgressEvent, Solution
     from radiosity.view import render_preview
 
 __all__ = [
+    "FormFactor",
     "Gatherer",
     "IrradianceEstimate",
     "PatchMesh",
     "ProgressEvent",
     "Solution",
     "ViewFactors",
+    "form_factor",
     "render_preview",
     "solve",
     "view_factors",
 ]
 
 _HOME = {
+    "FormFactor": "radiosity.form_factors.pair",
     "Gatherer": "radiosity.sensors",
     "IrradianceEstimate": "radiosity.sensors",
     "PatchMesh": "radiosity.patches",
     "ProgressEvent": "radiosity.solvers.solution",
     "Solution": "radiosity.solvers.solution",
     "ViewFactors": "radiosity.form_factors.matrix",
+    "form_factor": "radiosity.form_factors.pair",
     "render_preview": "radiosity.view",
     "solve": "radiosity.accuracy",
     "view_factors": "radiosity.form_factors.matrix",

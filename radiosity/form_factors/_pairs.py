@@ -49,13 +49,13 @@ _PLAIN = {"nogil": True, "cache": True, "_nrt": False}
 hand on takes longer than all their arithmetic, and threads would fight over the counts."""
 
 
-def pair_workspace(max_corners):
+def pair_workspace(max_corners, fragments=MAX_FRAGMENTS):
     """Scratch of one thread: fragments, their sizes and weights, crossings, a clipped pair, kept occluders."""
     room = max(ROOM, 2 * max_corners + 6)
     return (
-        np.empty((MAX_FRAGMENTS + 2, room, 3)),
-        np.empty(MAX_FRAGMENTS + 2, dtype=np.int64),
-        np.empty(MAX_FRAGMENTS + 2),
+        np.empty((fragments + 2, room, 3)),
+        np.empty(fragments + 2, dtype=np.int64),
+        np.empty(fragments + 2),
         np.empty((4 * room * room, 2)),
         np.empty((4, 2 * room, 3)),
         np.empty(MAX_CUT, dtype=np.int64),
@@ -76,7 +76,7 @@ def subtract(corners, k0, k1, nx, ny, nz, d, through, x, y, z, fragments, sizes,
     if abs(height) <= near:
         return count
     sign = 1.0 if height > 0.0 else -1.0
-    capacity = MAX_FRAGMENTS
+    capacity = fragments.shape[0] - 2
     spare = capacity + 1
     room = fragments.shape[1]
     done = 0
