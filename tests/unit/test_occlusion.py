@@ -14,6 +14,7 @@ from workbench.accel.brute import BruteForce
 from workbench.errors import InputError, OptionError
 from workbench.geometry.polygons import convex_pieces, vector_area
 from workbench.geometry.tessellation import sphere_mesh
+from workbench.shadow import occlusion
 from workbench.shadow.lights import (
     DirectionalLight,
     DiskLight,
@@ -297,17 +298,45 @@ def test_auto_meets_its_asked_error_under_a_torus(torus, error):
     for seed in (0, 1):
         found = torus.estimate(points, UP, SQUARE, "auto", error=error, seed=seed)
         assert np.sqrt(np.mean((found.irradiance[:, 0] - exact) ** 2)) <= error * exact.mean()
-        # And by fewer rays than K = (0.64 / share)^(4/3) at every point: the share may be off by 0.35 errors here.
-        assert found.counters["rays"] < 0.5 * (0.64 / (0.35 * error)) ** (4 / 3) * len(points)
+        # And without rays: by lines, of which L leave some 0.17 L^-3/2; the share may be off by 0.35 errors here.
+        assert found.counters["rays"] == 0
+        assert found.counters["sender_lines"] < 4 * (0.17 / (0.35 * error)) ** (2 / 3) * len(points)
 
 
-def test_auto_does_not_drown_in_rays_where_all_is_dark():
+def test_auto_meets_its_asked_error_by_rays_and_fits(torus, monkeypatch):
+    # As it does behind panes and in thickets: no lines are drawn.
+    monkeypatch.setattr(occlusion, "line_tiles", lambda *arguments: None)
+    points = grid_points(72)
+    exact = torus.estimate(points, UP, SQUARE, "exact").irradiance[:, 0]
+    found = torus.estimate(points, UP, SQUARE, "auto", error=0.02)
+    assert np.sqrt(np.mean((found.irradiance[:, 0] - exact) ** 2)) <= 0.02 * exact.mean()
+    # Fewer rays than K = (0.64 / share)^(4/3) at every point: the share may be off by 0.35 errors here.
+    assert 0 < found.counters["rays"] < 0.5 * (0.64 / (0.35 * 0.02)) ** (4 / 3) * len(points)
+    assert found.counters["sender_lines"] == 0
+
+
+def test_panes_before_a_tessellated_occluder_dim_and_hide(torus):
+    # A wide pane of transmittance 1/2 above the torus halves all that passes.
+    pane = rectangle(-FAR, FAR, -FAR, FAR, 1.5)
+    triangles = [torus.geometry.piece(i) for i in range(torus.geometry.piece_count)]
+    shader = Shader(geometry_of(triangles, [pane], transmittance=[0.0, 0.5]), 1)
+    points = plane_points(40)
+    exact = torus.estimate(points, UP, SQUARE, "exact")
+    found = shader.estimate(points, UP, SQUARE, "auto", error=0.05)
+    assert np.abs(found.irradiance - 0.5 * exact.irradiance).max() < 0.1 * exact.irradiance.mean()
+    assert found.counters["sender_lines"] == 0
+
+
+def test_auto_draws_few_lines_where_all_is_dark():
     # A ball of 1,280 facets hides all of the light; the relative error of nothing has no bottom.
     vertices, faces, _, _ = sphere_mesh([0.0, 0.0, 1.0], 0.8, 0.005)
     points = grid_points(40, 0.2)
     found = estimate(points, UP, SQUARE, geometry_of(list(vertices[faces])), "auto", workers=1)
     assert not found.irradiance.any()
-    assert 0 < found.counters["rays"] < 3000 * len(points)
+    assert (found.state == DARK).all()
+    assert found.counters["rays"] == 0
+    # The pilot's alone: 8 at some 256 points.
+    assert found.counters["sender_lines"] <= 8 * 512
 
 
 # ---- other lights ------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import math
 
 from numba import njit
 
-__all__ = ["MAX_SHAFT_PLANES", "box_shaft"]
+__all__ = ["MAX_SHAFT_PLANES", "box_shaft", "tile_shaft"]
 
 MAX_SHAFT_PLANES = 6 + 12 + 2
 """Union box, linking planes, and the planes of a flat receiver and sender."""
@@ -61,4 +61,25 @@ def box_shaft(alow, ahigh, blow, bhigh, planes):
             planes[used, u], planes[used, v] = pu, pv
             planes[used, 3] = d + min(lowest, 0.0)
             used += 1
+    return used
+
+
+@njit(nogil=True, cache=True)
+def tile_shaft(bounds, normal, offset, sender_low, sender_high, sender_normal, ring, slack, planes):
+    """Planes of the shaft from a tile of receivers to a flat sender; their number.
+
+    ``bounds`` (2, 3) is the tile's box, ``normal`` (3,) and ``offset`` its plane (a zero normal for a
+    tile that is not flat), ``ring`` (k, 3) are the sender's corners.  All planes move inward by twice
+    ``slack``: irradiance is an integral, and what only touches the shaft hides a null set.
+    """
+    used = box_shaft(bounds[0], bounds[1], sender_low, sender_high, planes)
+    if normal[0] != 0.0 or normal[1] != 0.0 or normal[2] != 0.0:
+        planes[used, 0], planes[used, 1], planes[used, 2] = normal[0], normal[1], normal[2]
+        planes[used, 3] = offset
+        used += 1
+    planes[used, 0], planes[used, 1], planes[used, 2] = sender_normal[0], sender_normal[1], sender_normal[2]
+    planes[used, 3] = sender_normal[0] * ring[0, 0] + sender_normal[1] * ring[0, 1] + sender_normal[2] * ring[0, 2]
+    used += 1
+    for k in range(used):
+        planes[k, 3] += 2.0 * slack
     return used

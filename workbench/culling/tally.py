@@ -26,6 +26,8 @@ TALLY = (
     "exact_pieces",
     "exact_overflows",
     "links",
+    "silhouette_edges",
+    "sender_lines",
 )
 """Name of each row."""
 
@@ -46,6 +48,8 @@ TALLY = (
     PIECES,
     OVERFLOW,
     LINK,
+    EDGES,
+    LINES,
 ) = range(len(TALLY))
 
 

@@ -11,7 +11,7 @@ from numba import njit
 
 from workbench.accel.box_tree import boxes_meeting_planes
 from workbench.culling.plane_vertex import light_pyramid, outside_planes
-from workbench.culling.shaft import MAX_SHAFT_PLANES, box_shaft
+from workbench.culling.shaft import MAX_SHAFT_PLANES, tile_shaft
 from workbench.culling.tally import (
     CHECK,
     CLEAR,
@@ -36,7 +36,9 @@ MAX_CANDIDATES = 256
 SPLIT_DEPTH = 7
 """Most halvings of a sender whose exact cut has too many pieces."""
 
-STATE_CLEAR, STATE_DARK, STATE_COMPLEX, STATE_EXACT = 1, 2, 3, 4
+LATER, PASSED = -2, -3
+"""Counts of tiles whose points are left COMPLEX unseen, or not looked at."""
+STATE_CLEAR, STATE_DARK, STATE_COMPLEX, STATE_EXACT, STATE_SAMPLED = 1, 2, 3, 4, 5
 
 
 @njit(nogil=True, cache=True)
@@ -52,18 +54,9 @@ def tile_candidates(
     planes = np.empty((MAX_SHAFT_PLANES, 4))
     found = np.empty(MAX_CANDIDATES, dtype=np.int64)
     for t in range(first, last):
-        used = box_shaft(bounds_of[t, 0], bounds_of[t, 1], sender_low, sender_high, planes)
-        flat = normal[t, 0] != 0.0 or normal[t, 1] != 0.0 or normal[t, 2] != 0.0
-        if flat:
-            planes[used, 0], planes[used, 1], planes[used, 2] = normal[t, 0], normal[t, 1], normal[t, 2]
-            planes[used, 3] = offset[t]
-            used += 1
-        planes[used, 0], planes[used, 1], planes[used, 2] = sender_normal[0], sender_normal[1], sender_normal[2]
-        planes[used, 3] = sender_normal[0] * ring[0, 0] + sender_normal[1] * ring[0, 1] + sender_normal[2] * ring[0, 2]
-        used += 1
-        # Irradiance is an integral: what only touches the shaft hides a null set.
-        for k in range(used):
-            planes[k, 3] += 2.0 * slack
+        used = tile_shaft(
+            bounds_of[t], normal[t], offset[t], sender_low, sender_high, sender_normal, ring, slack, planes
+        )
         tally[SHAFT] += 1
         many = boxes_meeting_planes(low, high, skip, head, leaf, order, bounds, planes, used, slack, found, tally)
         if many > MAX_CANDIDATES:
@@ -72,7 +65,7 @@ def tile_candidates(
         kept = 0
         for i in range(many):
             piece = found[i]
-            if (flat and piece_polygon[piece] == own[t]) or piece_polygon[piece] == sender_own:
+            if piece_polygon[piece] == own[t] or piece_polygon[piece] == sender_own:
                 continue
             tally[SHAFT_TEST] += 1
             if outside_planes(corners, starts[piece], starts[piece + 1], planes, used, slack):
@@ -91,7 +84,7 @@ def settle_points(
     piece_polygon, through, low, high, skip, head, leaf, order, bounds, slack, limit, lists, counts, share, open_share,
     state, candidates, tally,
 ):  # fmt: skip
-    """Settle the points of tiles ``first..last`` for one convex sender piece.
+    """Settle the points of tiles ``first..last`` for one convex sender piece, but those settled before.
 
     ``open_share`` gets the unoccluded form factor of each point, ``share`` the visible one where it
     is known, ``state`` CLEAR, DARK, EXACT or COMPLEX, ``candidates`` the number of pieces left after
@@ -108,7 +101,11 @@ def settle_points(
     mx, my, mz = sender_normal[0], sender_normal[1], sender_normal[2]
     level = mx * sender[s0, 0] + my * sender[s0, 1] + mz * sender[s0, 2]
     for t in range(first, last):
+        if counts[t] == PASSED:
+            continue
         for i in range(tile_start[t], tile_start[t + 1]):
+            if state[i] != 0 and state[i] != STATE_COMPLEX:
+                continue
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
             value = 0.0
@@ -124,6 +121,9 @@ def settle_points(
             candidates[i] = 0
             if counts[t] == 0:
                 tally[CLEAR] += 1
+                continue
+            if counts[t] == LATER:
+                candidates[i], state[i] = limit + 1, STATE_COMPLEX
                 continue
             used = light_pyramid(x, y, z, nx, ny, nz, sender, s0, s1, sender_normal, 2.0 * slack, planes)
             many = counts[t]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -45,7 +45,9 @@ from workbench.shadow.lights import (
 )
 from workbench.shadow.linear import visible_linear_irradiance
 from workbench.shadow.rays import NOISE, visible_shares
+from workbench.shadow.silhouette import MAX_LINES, EdgeTable, SenderFrame, line_tiles
 from workbench.shadow.smooth import fill_smoothly
+from workbench.shadow.tiles import Tiles, sort_into_tiles
 
 __all__ = ["METHODS", "AreaLight", "OcclusionEstimate", "OcclusionState", "Shader", "estimate"]
 
@@ -57,12 +59,20 @@ METHODS = ("adaptive", "auto", "camera", "camera-optimised", "exact", "rays", "r
 _UNCULLED = ("adaptive", "rays", "rays+plane-vertex")
 """Methods that ask every point that faces the light."""
 
-TILE = (96, 1024)
-"""Points a tile, about: a 256th of a plane's, but at least and at most these."""
 MARGIN = 1.3
 """Errors of neighbouring fits partly cancel: measured errors stay below the asked one by this."""
+LINE_MARGIN = 0.8
+"""Share of the asked error that lines are drawn for: what they state scatters from point to point."""
 PILOT_POINTS = 256
 """Points that give a first idea of the mean irradiance."""
+PILOT_TILES = 24
+"""Tiles that they lie in, at least, where they get lines."""
+PILOT_LINES = 8
+"""Lines at each of them."""
+USUAL_NOISE = 0.16
+"""L lines usually leave an error of USUAL_NOISE L^-3/2 of a visible share past a tessellated torus."""
+LIST_LIMIT = 64
+"""Longest candidate list of a tile whose points ``auto`` looks at one by one before it draws lines."""
 CUT_LIMIT = 12
 """Longest candidate list that ``auto`` and ``shaft`` cut exactly."""
 LEAST_MEAN = 0.05
@@ -140,82 +150,6 @@ class OcclusionEstimate:
     seconds: dict[str, float]
 
 
-@dataclass(frozen=True)
-class _Tiles:
-    """Points sorted into tiles of neighbours on one plane."""
-
-    order: IntArray
-    points: FloatArray
-    normals: FloatArray
-    own: IntArray
-    flat: FloatArray
-    start: IntArray
-    bounds: FloatArray
-    normal: FloatArray
-    offset: FloatArray
-    polygon: IntArray
-
-
-def _planes_of(points: FloatArray, normals: FloatArray, own: IntArray, size: float) -> IntArray:
-    """Number (n,) of each point's plane: same normal, same offset, same polygon."""
-    key = np.column_stack([np.round(normals * 1e9), np.round(np.einsum("ij,ij->i", points, normals) / size * 1e9), own])
-    if (key == key[0]).all():
-        return np.zeros(len(points), dtype=np.int64)
-    return np.unique(key, axis=0, return_inverse=True)[1].ravel()
-
-
-def _tiles(points: FloatArray, normals: FloatArray, own: IntArray, size: float) -> _Tiles:
-    """Group points by plane, then by squares of that plane that hold about many points."""
-    plane = _planes_of(points, normals, own, size)
-    count = int(plane.max()) + 1
-    first = np.zeros(count, dtype=np.int64)
-    first[plane[::-1]] = np.arange(len(points))[::-1]
-    flat = np.empty((len(points), 2))
-    cell = np.empty((len(points), 2), dtype=np.int64)
-    if count > max(64, len(points) // 32):
-        # Scattered sensors: hardly two on a plane, each a tile of its own.
-        order = np.arange(len(points))
-        start = np.arange(len(points) + 1)
-        flat[:] = 0.0
-    else:
-        for number in range(count):
-            inside = np.flatnonzero(plane == number)
-            u, v = plane_basis(normals[first[number]])
-            here = np.column_stack([points[inside] @ u, points[inside] @ v])
-            low, extent = here.min(axis=0), np.ptp(here, axis=0)
-            tiles = max(1, round(len(inside) / min(max(len(inside) / 256, TILE[0]), TILE[1])))
-            aspect = extent[0] / extent[1] if extent[1] > 0 else math.inf
-            across = min(max(round(math.sqrt(tiles * min(aspect, tiles))), 1), tiles)
-            counts = np.array([across, max(1, round(tiles / across))])
-            scaled = (here - low) / np.where(extent > 0, extent, 1.0) * counts
-            cell[inside] = np.minimum(scaled.astype(np.int64), counts - 1)
-            flat[inside] = here
-        key = (plane * (int(cell[:, 0].max()) + 1) + cell[:, 0]) * (int(cell[:, 1].max()) + 1) + cell[:, 1]
-        order = np.argsort(key, kind="stable")
-        start = np.concatenate([[0], np.flatnonzero(np.diff(key[order])) + 1, [len(points)]])
-    moved = np.ascontiguousarray(points[order])
-    bounds = np.stack([np.minimum.reduceat(moved, start[:-1]), np.maximum.reduceat(moved, start[:-1])], axis=1)
-    ordered = np.ascontiguousarray(normals[order])
-    lead = start[:-1]
-    tile = np.repeat(np.arange(len(lead)), np.diff(start))
-    height = np.einsum("ij,ij->i", ordered[lead][tile], moved)
-    # Points of a tile lie on one plane to a billionth; its lowest point and tilt bound the horizon.
-    tilt = np.maximum.reduceat(np.abs(ordered - ordered[lead][tile]).max(axis=1), lead)
-    offset = np.minimum.reduceat(height, lead) - 4.0 * size * tilt
-    return _Tiles(
-        order=order,
-        points=moved,
-        normals=ordered,
-        own=np.ascontiguousarray(own[order]),
-        flat=np.ascontiguousarray(flat[order]),
-        start=start.astype(np.int64),
-        bounds=np.ascontiguousarray(bounds),
-        normal=np.ascontiguousarray(ordered[lead]),
-        offset=offset,
-        polygon=np.ascontiguousarray(own[order][lead]),
-    )
-
-
 def _rays_for(error: float) -> int:
     """Rays at a point whose visible share is wanted to ``error``."""
     return int(min(max((NOISE / error) ** (4.0 / 3.0), 16), 65536))
@@ -250,6 +184,22 @@ class _Answer:
         state = np.where(whole > 0.0, OcclusionState.COMPLEX_SHADOW, OcclusionState.INSHADOW).astype(np.int8)
         unknown = np.full(len(whole), -1, dtype=np.int64)
         return cls(whole, np.zeros(len(whole)), np.zeros(len(whole)), state, unknown)
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """What is known (n,) of one convex piece of a light: form factors, states, candidates left."""
+
+    part: FloatArray
+    share: FloatArray
+    doubt: FloatArray
+    state: NDArray[np.int8]
+    candidates: IntArray
+
+    @classmethod
+    def empty(cls, n: int) -> _Settled:
+        """Nothing yet."""
+        return cls(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int8), np.zeros(n, dtype=np.int64))
 
 
 def _round_ring(centre: FloatArray, radius: float, normal: FloatArray) -> FloatArray:
@@ -323,6 +273,10 @@ class Shader:
         return self._tree
 
     @cached_property
+    def _edges(self) -> EdgeTable:
+        return EdgeTable.build(self.geometry)
+
+    @cached_property
     def grid(self) -> VoxelGrid:
         """The instrument's voxels, for counted rays and for panes; a pane has one transmittance, its mean."""
         grey = tuple(
@@ -373,7 +327,7 @@ class Shader:
         counters = Counters()
         seconds: dict[str, float] = {}
         start = time.perf_counter()
-        tiles = _tiles(where, facing, own, self.geometry.size)
+        tiles = sort_into_tiles(where, facing, own, self.geometry.size)
         seconds["tiles"] = time.perf_counter() - start
         far = max(float(np.abs(where).max()), float(np.abs(self.geometry.bounds).max()))
         slack = max(CHECK_SLACK * self.geometry.size, ROUNDING * far)
@@ -395,7 +349,7 @@ class Shader:
             state, open_share, visible, visible @ power, np.sqrt(variance), candidates, counters, seconds
         )
 
-    def _one_light(self, tiles: _Tiles, light: AreaLight | Sender, task: _Task) -> _Answer:
+    def _one_light(self, tiles: Tiles, light: AreaLight | Sender, task: _Task) -> _Answer:
         if isinstance(light, (DirectionalLight, PointLight)):
             return self._single_rays(tiles, light, task)
         if isinstance(light, LinearLight):
@@ -431,7 +385,7 @@ class Shader:
         answer.doubt[partly] = np.hypot(answer.doubt, ROUND_ERROR * whole)[partly]
         answer.open = whole
 
-    def _bundle(self, tiles: _Tiles, rows: IntArray, count: int, task: _Task) -> _sampled.Bundle:
+    def _bundle(self, tiles: Tiles, rows: IntArray, count: int, task: _Task) -> _sampled.Bundle:
         return _sampled.Bundle(
             tiles.points[rows], tiles.normals[rows], tiles.order[rows], tiles.own[rows], count, task.seed, self.workers,
             LIFT * self.geometry.size + 4.0 * task.slack,
@@ -439,7 +393,7 @@ class Shader:
 
     # ---- lights without area ------------------------------------------------------------------
 
-    def _single_rays(self, tiles: _Tiles, light: Sender, task: _Task) -> _Answer:
+    def _single_rays(self, tiles: Tiles, light: Sender, task: _Task) -> _Answer:
         """Lights of one place or direction: whatever the method, one ray a point."""
         answer = _Answer.sampled(light.unit_irradiance(tiles.points, tiles.normals))
         rows = np.flatnonzero(answer.open > 0.0)
@@ -449,7 +403,7 @@ class Shader:
         answer.state[rows[share == 0.0]] = OcclusionState.INSHADOW
         return answer
 
-    def _linear(self, tiles: _Tiles, light: LinearLight, task: _Task) -> _Answer:
+    def _linear(self, tiles: Tiles, light: LinearLight, task: _Task) -> _Answer:
         """A linear light: exact past opaque surfaces, otherwise by rays."""
         answer = _Answer.sampled(light.unit_irradiance(tiles.points, tiles.normals))
         rows = np.flatnonzero(answer.open > 0.0)
@@ -492,7 +446,7 @@ class Shader:
         add_tally(task.counters, tally)
         return np.sort(found[:many])
 
-    def _sphere(self, tiles: _Tiles, light: SphereLight, task: _Task) -> _Answer:
+    def _sphere(self, tiles: Tiles, light: SphereLight, task: _Task) -> _Answer:
         """A sphere: from each point a disk of its own; rays to the cap that it sees."""
         answer = _Answer.sampled(light.unit_irradiance(tiles.points, tiles.normals))
         rows = np.flatnonzero(answer.open > 0.0)
@@ -539,7 +493,7 @@ class Shader:
             owners = np.where(np.isin(owners, polygons), polygons[0], owners)
         return owners, int(polygons[0]) if len(polygons) else -1
 
-    def _side(self, tiles: _Tiles, pieces: list[FloatArray], polygons: IntArray, task: _Task) -> _Answer:
+    def _side(self, tiles: Tiles, pieces: list[FloatArray], polygons: IntArray, task: _Task) -> _Answer:
         """One emitting side of a flat light, given as convex pieces."""
         normal = vector_area(pieces[0])
         normal /= np.linalg.norm(normal)
@@ -553,23 +507,28 @@ class Shader:
         candidates = np.full(n, -1 if task.method in _UNCULLED else 0, dtype=np.int64)
         for ring in pieces:
             begin = time.perf_counter()
-            part, share, state, left = self._settle(tiles, ring, normal, owners, polygon, task)
+            found = self._settle(tiles, ring, normal, owners, polygon, task)
             task.seconds["settle"] = task.seconds.get("settle", 0.0) + time.perf_counter() - begin
-            whole += part
+            if task.method == "auto":
+                begin = time.perf_counter()
+                self._draw_lines(tiles, ring, normal, owners, polygon, found, task)
+                task.seconds["lines"] = task.seconds.get("lines", 0.0) + time.perf_counter() - begin
+            whole += found.part
             if task.method not in _UNCULLED:
-                candidates += left
-            waiting = np.flatnonzero(state == _settle.STATE_COMPLEX)
+                candidates += found.candidates
+            waiting = np.flatnonzero(found.state == _settle.STATE_COMPLEX)
             known = np.ones(n, dtype=bool)
             if task.method == "exact":
                 begin = time.perf_counter()
-                self._cut(tiles, waiting, ring, normal, owners, polygon, share, doubt, task)
+                self._cut(tiles, waiting, ring, normal, owners, polygon, found.share, doubt, task)
                 task.seconds["cut"] = task.seconds.get("cut", 0.0) + time.perf_counter() - begin
             else:
                 known[waiting] = False
-                waiting_parts.append((ring, waiting, part))
-            seen[known] += share[known]
-            lit &= (state == _settle.STATE_CLEAR) | (part == 0.0)
-            dark &= known & (share == 0.0)
+                waiting_parts.append((ring, waiting, found.part))
+            seen[known] += found.share[known]
+            doubt += found.doubt
+            lit &= (found.state == _settle.STATE_CLEAR) | (found.part == 0.0)
+            dark &= known & (found.share == 0.0) & (found.state != _settle.STATE_SAMPLED)
         for ring, waiting, part in waiting_parts:
             if len(waiting):
                 begin = time.perf_counter()
@@ -581,47 +540,127 @@ class Shader:
         return _Answer(whole, seen, doubt, state, candidates)
 
     def _settle(
-        self, tiles: _Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, task: _Task
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.int8], IntArray]:
-        """Unoccluded and (where known) visible form factors to a convex piece, states, candidates left."""
-        geo = self.geometry
+        self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, task: _Task
+    ) -> _Settled:
+        """Form factors to a convex piece, unoccluded and (where known) visible, states, candidates left."""
         culled = task.method not in _UNCULLED
-        n, count = len(tiles.points), len(tiles.start) - 1
-        part, share = np.zeros(n), np.zeros(n)
-        state, left = np.zeros(n, dtype=np.int8), np.zeros(n, dtype=np.int64)
-        counts = np.full(count, -1 if culled else 0, dtype=np.int64)  # 0: only the open form factors are asked for
-        lists = np.empty((count, _settle.MAX_CANDIDATES), dtype=np.int64)
+        found = _Settled.empty(len(tiles.points))
+        # 0: only the open form factors are asked for.
+        counts = np.full(len(tiles.start) - 1, -1 if culled else 0, dtype=np.int64)
+        self._settle_tiles(tiles, ring, normal, owners, own, counts, found, task, list_first=culled)
+        if not culled:
+            found.state[found.state == _settle.STATE_CLEAR] = _settle.STATE_COMPLEX
+        return found
+
+    def _settle_tiles(
+        self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, counts: IntArray,
+        found: _Settled, task: _Task, *, list_first: bool,
+    ) -> None:  # fmt: skip
+        """Settle tiles by their candidates: as listed in ``counts`` or, ``list_first``, as shafts find them."""
+        geo = self.geometry
+        count = len(counts)
+        lists = np.empty((count if list_first else 0, _settle.MAX_CANDIDATES), dtype=np.int64)
         low, high = ring.min(axis=0), ring.max(axis=0)
         limit = 64 if task.method == "exact" else CUT_LIMIT
-        step = max(1, -(-count // 64))
 
-        def work(first: int) -> NDArray[np.int64]:
-            last = min(first + step, count)
+        def work(first: int, last: int) -> NDArray[np.int64]:
             tally = new_tally()
-            if culled:
+            if list_first:
                 _settle.tile_candidates(
                     tiles.bounds, tiles.normal, tiles.offset, tiles.polygon, first, last, ring, low, high, normal, own,
                     geo.corners, geo.piece_start, owners, *self._tree, task.slack, lists, counts, tally,
                 )  # fmt: skip
+                if task.method == "auto":
+                    here = counts[first:last]
+                    here[(here < 0) | (here > LIST_LIMIT)] = _settle.LATER
             _settle.settle_points(
                 tiles.points, tiles.normals, tiles.own, tiles.start, first, last, ring, 0, len(ring), normal, own,
                 geo.corners, geo.piece_start, owners, self._through, *self._tree, task.slack, limit, lists,
-                counts, share, part, state, left, tally,
+                counts, found.share, found.part, found.state, found.candidates, tally,
             )  # fmt: skip
             return tally
 
+        for tally in self._blocks(work, count):
+            if task.method in _UNCULLED:
+                task.counters.add(closed_forms=tally[CLOSED])
+            else:
+                add_tally(task.counters, tally)
+
+    def _blocks(self, work: Callable[[int, int], NDArray[np.int64]], count: int, most: int = 64) -> list[IntArray]:
+        """Tallies of ``work(first, last)`` over ``most`` equal ranges of ``count`` rows, on all workers."""
+        step = max(1, -(-count // most))
+        ranges = [(first, min(first + step, count)) for first in range(0, count, step)]
+        if self.workers == 1 or len(ranges) == 1:
+            return [work(*each) for each in ranges]
         with ThreadPoolExecutor(self.workers) as pool:
-            for tally in pool.map(work, range(0, count, step)):
-                if culled:
-                    add_tally(task.counters, tally)
-                else:
-                    task.counters.add(closed_forms=tally[CLOSED])
-        if not culled:
-            state[state == _settle.STATE_CLEAR] = _settle.STATE_COMPLEX
-        return part, share, state, left
+            return list(pool.map(lambda each: work(*each), ranges))
+
+    def _draw_lines(
+        self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, found: _Settled,
+        task: _Task,
+    ) -> None:  # fmt: skip
+        """Lines over the sender at the points that ``found`` leaves, as many as the error asks."""
+        state = found.state
+        waiting = np.flatnonzero(state == _settle.STATE_COMPLEX)
+        if not len(waiting):
+            return
+        edges = self._edges
+        frame = SenderFrame.build(self.geometry, edges, ring, normal)
+        tree = self._tree
+        sender = (ring, ring.min(axis=0), ring.max(axis=0), normal, own)
+        table = (
+            self.geometry.piece_start, owners, self._through, edges.vertex, edges.edge, edges.ends, edges.piece,
+            edges.turn,
+        )  # fmt: skip
+        axes = (frame.origin, frame.axes, frame.ring, frame.place, frame.plane, frame.height)
+        spread = (
+            tiles.points, tiles.normals, tiles.order, tiles.own, tiles.start, tiles.bounds, tiles.normal, tiles.offset,
+            tiles.polygon,
+        )  # fmt: skip
+
+        def draw(chosen: IntArray, answer: _Settled, fewest: int, most: int, allowed: float, rays: int) -> None:
+            def work(first: int, last: int) -> NDArray[np.int64]:
+                tally = new_tally()
+                line_tiles(
+                    chosen[first:last], spread, sender, table, axes, tree, task.slack, fewest, most, allowed,
+                    rays, task.seed, CUT_LIMIT,
+                    (answer.part, answer.share, answer.doubt, answer.state, answer.candidates), tally,
+                )  # fmt: skip
+                return tally
+
+            for tally in self._blocks(work, len(chosen), 8 * self.workers):
+                add_tally(task.counters, tally)
+
+        # The error is asked of the irradiance over all points: what may a share here be off by?
+        tile = tiles.of(waiting)
+        chosen = np.unique(tile)
+        some = chosen[:: max(1, min(len(chosen) // PILOT_TILES, len(waiting) // PILOT_POINTS))]
+        pilot = waiting[np.isin(tile, some)]
+        pilot = pilot[:: max(1, len(pilot) // PILOT_POINTS)]
+        trial = replace(found, share=found.share.copy(), doubt=found.doubt.copy(), state=np.zeros_like(state))
+        trial.state[pilot] = _settle.STATE_COMPLEX
+        draw(np.unique(tiles.of(pilot)), trial, PILOT_LINES, PILOT_LINES, 1.0, PILOT_POINTS)
+        drawn = pilot[trial.state[pilot] != _settle.STATE_COMPLEX]
+        known = float(found.share[state != _settle.STATE_COMPLEX].sum())
+        mean = (known + float(trial.share[drawn].sum()) / len(pilot) * len(waiting)) / len(state)
+        allowed = LINE_MARGIN * self._allowed(found.part, waiting, mean, task)
+        fewest = min(max(math.ceil((USUAL_NOISE / allowed) ** (2.0 / 3.0)), 4), MAX_LINES)
+        draw(chosen, found, fewest, min(16 * fewest, MAX_LINES), allowed, _rays_for(allowed))
+        left = np.unique(tiles.of(np.flatnonzero(state == _settle.STATE_COMPLEX)))
+        if len(left):
+            counts = np.full(len(tiles.start) - 1, _settle.PASSED, dtype=np.int64)
+            counts[left] = -1
+            self._settle_tiles(tiles, ring, normal, owners, own, counts, found, task, list_first=False)
+
+    @staticmethod
+    def _allowed(part: FloatArray, waiting: IntArray, mean: float, task: _Task) -> float:
+        """Error that the shares of the waiting points may have, for the error asked of the mean of all."""
+        mean = max(mean, LEAST_MEAN * float(part.mean()))
+        weight = math.sqrt(float((part[waiting] ** 2).sum()) / len(part))
+        return min(max(task.error * mean / weight, 1e-5), 0.25)
 
     def _cut(
-        self, tiles: _Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int,
+        self, tiles: Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int,
         share: FloatArray, doubt: FloatArray, task: _Task,
     ) -> None:  # fmt: skip
         """Exact cuts at crowded points, the light quartered as far as needed."""
@@ -642,14 +681,14 @@ class Shader:
         doubt += unsure
 
     def _camera(
-        self, tiles: _Tiles, pieces: list[FloatArray], normal: FloatArray, polygons: IntArray, task: _Task
+        self, tiles: Tiles, pieces: list[FloatArray], normal: FloatArray, polygons: IntArray, task: _Task
     ) -> _Answer:
         """Cameras at the points; what no camera sees well is cut exactly."""
         geo = self.geometry
         open_task = replace(task, method="rays")
         whole = np.zeros(len(tiles.points))
         for ring in pieces:
-            whole += self._settle(tiles, ring, normal, geo.piece_polygon, -1, open_task)[0]
+            whole += self._settle(tiles, ring, normal, geo.piece_polygon, -1, open_task).part
         answer = _Answer.sampled(whole)
         viewport = min(max(round(math.sqrt(task.samples)), 2), 1024)
         begin = time.perf_counter()
@@ -671,7 +710,7 @@ class Shader:
         answer.state[facing & (found.state == CameraState.INSHADOW)] = OcclusionState.INSHADOW
         rows = np.flatnonzero(found.fallback & facing)
         if len(rows):
-            left = _tiles(tiles.points[rows], tiles.normals[rows], tiles.own[rows], geo.size)
+            left = sort_into_tiles(tiles.points[rows], tiles.normals[rows], tiles.own[rows], geo.size)
             cut = self._side(left, pieces, polygons, replace(task, method="exact"))
             answer.seen[rows[left.order]] = cut.seen
             answer.doubt[rows[left.order]] = cut.doubt
@@ -679,7 +718,7 @@ class Shader:
         return answer
 
     def _trace(
-        self, tiles: _Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, polygon: int, part: FloatArray,
+        self, tiles: Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, polygon: int, part: FloatArray,
         seen: FloatArray, doubt: FloatArray, task: _Task,
     ) -> None:  # fmt: skip
         """Rays at the points that are left, all of them or as many as a smooth fit needs."""
@@ -705,11 +744,9 @@ class Shader:
             # The error is asked of the irradiance over all points: what may a share here be off by?
             pilot = waiting[:: max(1, len(waiting) // PILOT_POINTS)]
             mean = (seen.sum() + float((sample(pilot, 16)[0] * part[pilot]).mean()) * len(waiting)) / n
-            mean = max(mean, LEAST_MEAN * float(part.mean()))
-            weight = math.sqrt(float((part[waiting] ** 2).sum()) / n)
-            allowed = min(max(MARGIN * task.error * mean / weight, 1e-5), 0.25)
+            allowed = MARGIN * self._allowed(part, waiting, mean, task)
             # Rows of the complex points only, tile by tile.
-            tile = np.searchsorted(tiles.start, waiting, side="right") - 1
+            tile = tiles.of(waiting)
             edges = np.concatenate([[0], np.flatnonzero(np.diff(tile)) + 1, [len(waiting)]])
             share, spread = np.zeros(len(waiting)), np.zeros(len(waiting))
             fill_smoothly(
@@ -757,8 +794,10 @@ def estimate(
         or only where the plane-vertex check leaves occluders; exact cuts where no camera sees well.
         ``shaft`` -- shafts and light pyramids first, exact cuts of short lists, rays for the rest.
         ``exact`` -- every point cut exactly, the light quartered where it is crowded.
-        ``auto`` -- as ``shaft``, with as many rays as ``error`` asks, and only at as many points of a
-        tile as a smooth fit needs.
+        ``auto`` -- shafts and light pyramids first, exact cuts of short lists; past long ones, lines over
+        the light cut by silhouettes (:mod:`workbench.shadow.silhouette`), as many as ``error`` asks.
+        What has panes before it, or more edges than lines are worth, gets rays, and only at as many
+        points of a tile as a smooth fit needs.
 
         Lights without extent are settled by their one ray, whatever the method.  Linear lights are
         exact by ``exact``, ``shaft`` and ``auto``.  A disk is sampled, cut and drawn as a regular polygon

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
 
-__all__ = ["NOISE", "lattice", "sender_samples", "visible_shares", "weighted_shares"]
+__all__ = ["NOISE", "lattice", "sender_samples", "shift", "visible_shares", "weighted_shares"]
 
 FloatArray = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def sender_samples(ring: FloatArray, unit: FloatArray) -> FloatArray:
 
 
 @njit(nogil=True, cache=True)
-def _shift(index, seed):
+def shift(index, seed):
     """SplitMix64 of a point's number: a shift (u, v) of the lattice of its own, whatever the blocks."""
     h = np.uint64(index) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed) * np.uint64(0x94D049BB133111EB)
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -60,7 +60,7 @@ def _shift(index, seed):
 @njit(nogil=True, cache=True)
 def _fill_lattice(index, seed, out):
     for row in range(out.shape[0]):
-        u, v = _shift(index[row], seed)
+        u, v = shift(index[row], seed)
         for k in range(out.shape[1]):
             u += 1.0 / _G2
             v += 1.0 / (_G2 * _G2)
@@ -93,7 +93,7 @@ def _make_rays(
             parallelogram = False
     row = 0
     for i in range(first, last):
-        u, v = _shift(index[i], seed)
+        u, v = shift(index[i], seed)
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         sx, sy, sz = px + offset * nx, py + offset * ny, pz + offset * nz

@@ -1,0 +1,791 @@
+"""Visible shares past tessellated occluders: lines over the sender, cut by silhouette edges.
+
+Seen from a point, every polygon covers a part of the sender's plane, and a place of the sender is
+hidden where one layer or more cover it.  Along a line over the sender the number of layers changes
+only where a projected edge crosses it: by one where the edge has one polygon, by two where both its
+polygons lie on the same side (a silhouette), not at all where they lie on opposite sides.  The
+count is therefore kept by the silhouettes alone, whatever the polygons are: closed or open, several
+surfaces through one another (their union hides), wound as they come.  Between two changes the
+irradiance along the line is a closed integral, so that a few lines across the sender give what
+thousands of rays would.
+
+Edges that can be no silhouette for any point of a tile are dropped for all of it, and of the rest
+most for each group of neighbours in it.
+
+Cf. S. Laine, T. Aila, U. Assarsson, J. Lehtinen and T. Akenine-Moller, "Soft shadow volumes for ray
+tracing" (SIGGRAPH 2005), which counts layers over samples of the sender by silhouette edges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workbench.accel.box_tree import boxes_meeting_planes
+from workbench.culling.shaft import MAX_SHAFT_PLANES, tile_shaft
+from workbench.culling.tally import CLEAR, COMPLEX, DARK, EDGES, EMPTY, LINES, SHAFT
+from workbench.geometry.flat import Geometry
+from workbench.geometry.planes import clip_by_plane
+from workbench.shadow._settle import STATE_CLEAR, STATE_COMPLEX, STATE_DARK, STATE_SAMPLED
+from workbench.shadow.rays import shift
+from workbench.shadow.tiles import DIFFERENT
+
+__all__ = ["LINE_NOISE", "MAX_LINES", "EdgeTable", "SenderFrame", "line_tiles"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LINE_NOISE = 0.17
+"""Measured past tori, balls, leaves and fences: L lines, each crossed c times, leave an error of
+LINE_NOISE c^1/2 L^-3/2 of a visible share."""
+BEND_NOISE = 0.1
+"""And as much of the root of the summed squares of its second differences from line to line."""
+SURE = 1.5
+"""Stated errors scatter: more lines are drawn where they exceed the allowed one by this."""
+MAX_LINES = 1024
+GROUP, PART = 64, 16
+"""Neighbouring points that share a list of edges, and of those that do where the list is long."""
+CROWDED = 512
+"""Edges that make a list long."""
+EDGES_A_RAY = 8
+"""Edges that cost as much as a ray, and some more: fits need rays at some of the points only."""
+CROSSINGS = 128
+"""Most crossings of a line that are kept; a point with more is left to rays."""
+NEAR = 1e-10
+"""What lies closer to a point than this share of its distance from the sender's plane hides nothing."""
+UNSURE = 2
+"""Class of a piece that some points of a tile see from its front and some from its back."""
+_SLOPE = 0.381966
+"""Slope of the lines across the sender's frame: edges parallel to its sides must not run along them."""
+
+
+@dataclass(frozen=True)
+class EdgeTable:
+    """The edges of all convex pieces, each with the pieces that share it.
+
+    Corners at exactly the same place are one vertex.  An edge of more than two pieces has more
+    than one row; pieces of no common edge (a crack, a T-junction) have a row each.
+
+    Parameters
+    ----------
+    place : (v, 3) float
+        Vertices.
+    vertex, edge : (k,) int
+        Vertex of each corner of the geometry, and the edge from it to the next corner of its piece.
+    ends : (e, 2) int
+        Vertices of each edge.
+    piece : (e, 2) int
+        Pieces on it, -1 for none.
+    turn : (e, 2) int
+        1 where the piece runs along the edge as ``ends`` does, -1 where against, 0 for none.
+    """
+
+    place: FloatArray
+    vertex: NDArray[np.int32]
+    edge: NDArray[np.int32]
+    ends: NDArray[np.int32]
+    piece: NDArray[np.int32]
+    turn: NDArray[np.int32]
+
+    @classmethod
+    def build(cls, geometry: Geometry) -> EdgeTable:
+        """Find the vertices and edges of a geometry."""
+        corners, start = geometry.corners + 0.0, geometry.piece_start
+        count = len(corners)
+        order = np.lexsort(corners.T)
+        ranked = corners[order]
+        new = np.ones(count, dtype=bool)
+        new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
+        vertex = np.empty(count, dtype=np.int64)
+        vertex[order] = np.cumsum(new) - 1
+        following = np.arange(1, count + 1)
+        following[start[1:] - 1] = start[:-1]
+        head = vertex[following]
+        owner = np.repeat(np.arange(len(start) - 1), np.diff(start))
+        low, high = np.minimum(vertex, head), np.maximum(vertex, head)
+        turn = np.where(vertex < head, 1, -1)
+        order = np.lexsort((owner, high, low))
+        fresh = np.ones(count, dtype=bool)
+        fresh[1:] = (low[order][1:] != low[order][:-1]) | (high[order][1:] != high[order][:-1])
+        first = np.flatnonzero(fresh)
+        rank = np.arange(count) - np.repeat(first, np.diff(np.append(first, count)))
+        row = np.cumsum(rank % 2 == 0) - 1
+        rows = int(row[-1]) + 1 if count else 0
+        edge = np.empty(count, dtype=np.int64)
+        edge[order] = row
+        ends, piece, turns = np.zeros((rows, 2)), np.full((rows, 2), -1), np.zeros((rows, 2))
+        ends[row, 0], ends[row, 1] = low[order], high[order]
+        piece[row, rank % 2], turns[row, rank % 2] = owner[order], turn[order]
+        return cls(
+            np.ascontiguousarray(ranked[new]),
+            *(a.astype(np.int32) for a in (vertex, edge, ends, piece, turns)),
+        )
+
+
+@dataclass(frozen=True)
+class SenderFrame:
+    """A geometry in the frame of a flat sender: x along the lines, y across them, z its normal.
+
+    Parameters
+    ----------
+    origin : (3,) float
+    axes : (3, 3) float
+        Rows are the frame's axes.
+    ring : (k, 2) float
+        The sender's corners, counter-clockwise about its normal.
+    place : (v, 3) float
+        Vertices.
+    plane : (p, 4) float
+        Plane of each piece: normal and offset.
+    height : (p, 2) float
+        Lowest and highest z of each piece.
+    """
+
+    origin: FloatArray
+    axes: FloatArray
+    ring: FloatArray
+    place: FloatArray
+    plane: FloatArray
+    height: FloatArray
+
+    @classmethod
+    def build(cls, geometry: Geometry, edges: EdgeTable, ring: FloatArray, normal: FloatArray) -> SenderFrame:
+        """Turn a geometry into the frame of a convex sender with unit normal ``normal``."""
+        sides = np.roll(ring, -1, axis=0) - ring
+        along = sides[np.argmax(np.einsum("ij,ij->i", sides, sides))]
+        along = along / np.linalg.norm(along)
+        across = np.cross(normal, along)
+        x = np.ptp(ring @ along) * along + _SLOPE * np.ptp(ring @ across) * across
+        x /= np.linalg.norm(x)
+        axes = np.stack([x, np.cross(normal, x), normal])
+        place = np.ascontiguousarray((edges.place - ring[0]) @ axes.T)
+        height = place[edges.vertex, 2]
+        first = geometry.piece_start[:-1]
+        facing = geometry.piece_normal @ axes.T
+        offset = np.einsum("ij,ij->i", facing, place[edges.vertex[first]])
+        return cls(
+            np.ascontiguousarray(ring[0]),
+            axes,
+            np.ascontiguousarray(((ring - ring[0]) @ axes.T)[:, :2]),
+            place,
+            np.column_stack([facing, offset]),
+            np.column_stack([np.minimum.reduceat(height, first), np.maximum.reduceat(height, first)])
+            if len(first)
+            else np.empty((0, 2)),
+        )
+
+
+@njit(nogil=True, cache=True)
+def _side(plane, box):
+    """1 or -1 if all of a box lies in front of or behind a plane, UNSURE if not."""
+    low = high = -plane[3]
+    for axis in range(3):
+        a, b = plane[axis] * box[0, axis], plane[axis] * box[1, axis]
+        low += min(a, b)
+        high += max(a, b)
+    return 1 if low > 0.0 else (-1 if high < 0.0 else UNSURE)
+
+
+@njit(nogil=True, cache=True)
+def _reach(v, box, reach):
+    """Where on the sender's plane a vertex may be seen from the points of a box: least x, least and greatest y."""
+    least = lowest = np.inf
+    highest = -np.inf
+    for i in range(2):
+        r = box[i, 2] / (box[i, 2] - v[2])
+        for j in range(2):
+            y = v[1] * r + box[j, 1] * (1.0 - r)
+            least = min(least, v[0] * r + box[j, 0] * (1.0 - r))
+            lowest = min(lowest, y)
+            highest = max(highest, y)
+    reach[0], reach[1], reach[2] = least, lowest, highest
+
+
+@njit(nogil=True, cache=True)
+def _clip_ring(ring, nx, ny, level, out):
+    """The part of a convex ring where nx x + ny y >= level; its number of corners."""
+    kept = 0
+    last = ring.shape[0] - 1
+    px, py = ring[last, 0], ring[last, 1]
+    dp = nx * px + ny * py - level
+    for i in range(ring.shape[0]):
+        cx, cy = ring[i, 0], ring[i, 1]
+        dc = nx * cx + ny * cy - level
+        if (dp > 0.0 and dc < 0.0) or (dp < 0.0 and dc > 0.0):
+            t = dp / (dp - dc)
+            out[kept, 0], out[kept, 1] = px + t * (cx - px), py + t * (cy - py)
+            kept += 1
+        if dc >= 0.0:
+            out[kept, 0], out[kept, 1] = cx, cy
+            kept += 1
+        px, py, dp = cx, cy, dc
+    return kept
+
+
+@njit(nogil=True, cache=True)
+def _separated(ring, count, ax, ay, bx, by):
+    """Whether a side of a counter-clockwise convex ring has all of the segment a-b outside it, or on it."""
+    for i in range(count):
+        j = i + 1 if i + 1 < count else 0
+        ex, ey = ring[j, 0] - ring[i, 0], ring[j, 1] - ring[i, 1]
+        if (
+            ex * (ay - ring[i, 1]) - ey * (ax - ring[i, 0]) <= 0.0
+            and ex * (by - ring[i, 1]) - ey * (bx - ring[i, 0]) <= 0.0
+        ):
+            return True
+    return False
+
+
+@njit(nogil=True, cache=True)
+def _cross(ax, at, bx, bt, change, lines, left, right, before, many, where, steps):
+    """Enter the crossings of an edge with the lines; False when a line has no room.
+
+    ``at`` and ``bt`` count lines: line k lies at k.  ``change`` is the change of layers in +x where
+    the edge runs toward higher lines.
+    """
+    a = int(min(max(math.ceil(at), 0.0), lines))
+    b = int(min(max(math.ceil(bt), 0.0), lines))
+    if a == b:
+        return True
+    if a > b:
+        a, b = b, a
+        change = -change
+    slope = (bx - ax) / (bt - at)
+    for k in range(a, b):
+        # From the nearer end: the other may be very far away.
+        x = ax + (k - at) * slope if abs(k - at) <= abs(k - bt) else bx + (k - bt) * slope
+        if x >= right[k]:
+            continue
+        if x <= left[k]:
+            before[k] += change
+            continue
+        i = many[k]
+        if i == where.shape[1]:
+            return False
+        while i > 0 and where[k, i - 1] > x:
+            where[k, i], steps[k, i] = where[k, i - 1], steps[k, i - 1]
+            i -= 1
+        where[k, i], steps[k, i] = x, change
+        many[k] += 1
+    return True
+
+
+@njit(nogil=True, cache=True)
+def _along(p, q, c, alpha, beta):
+    """Integral of (alpha + beta x) / (c^2 + x^2)^2 from p to q: the irradiance along a line, but for a factor."""
+    square = c * c
+    a, b = 1.0 / (square + p * p), 1.0 / (square + q * q)
+    ratio = alpha / square
+    angle = math.atan2(c * (q - p), square + p * q)
+    return 0.5 * ((ratio * q - beta) * b - (ratio * p - beta) * a + ratio / c * angle)
+
+
+@njit(nogil=True, cache=True)
+def _sum_lines(lines, y0, dy, px, py, h, nx, ny, nz, left, right, before, many, where, steps, hidden):
+    """Hidden share over all lines and its standard error; ``hidden`` is scratch (2, lines)."""
+    whole = total = 0.0
+    crossings = 0
+    for k in range(lines):
+        hidden[0, k] = hidden[1, k] = 0.0
+        if right[k] <= left[k]:
+            continue
+        y = y0 + k * dy - py
+        c = math.sqrt(y * y + h * h)
+        alpha = ny * y - nz * h
+        full = max(_along(left[k] - px, right[k] - px, c, alpha, nx), 0.0)
+        crossings += many[k]
+        layers = before[k]
+        start = left[k]
+        dark = 0.0
+        for i in range(many[k]):
+            after = layers + steps[k, i]
+            if layers <= 0 and after > 0:
+                start = where[k, i]
+            elif layers > 0 and after <= 0:
+                dark += _along(start - px, where[k, i] - px, c, alpha, nx)
+            layers = after
+        if layers > 0:
+            dark = full if many[k] == 0 else dark + _along(start - px, right[k] - px, c, alpha, nx)
+        dark = min(max(dark, 0.0), full)
+        whole += full
+        total += dark
+        hidden[0, k] = full
+        hidden[1, k] = dark / full if full > 0.0 else 0.0
+    if whole <= 0.0:
+        return 0.0, 0.0
+    # A measured law: the more crossings, the more corners between the lines.
+    square = LINE_NOISE * LINE_NOISE * crossings / lines**4
+    # And how unevenly the share changes from line to line.
+    if lines >= 3:
+        spread = 0.0
+        for k in range(1, lines - 1):
+            bend = hidden[0, k] / whole * (hidden[1, k - 1] - 2.0 * hidden[1, k] + hidden[1, k + 1])
+            spread += bend * bend
+        square += BEND_NOISE * BEND_NOISE * spread * lines / (lines - 2.0)
+    return min(total / whole, 1.0), max(math.sqrt(square), 0.1 / (lines * lines))
+
+
+@njit(nogil=True, cache=True)
+def _turned(axes, x, y, z):
+    """A vector in a frame of three axes."""
+    return (
+        axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z,
+        axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z,
+        axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z,
+    )
+
+
+@njit(nogil=True, cache=True)
+def _bounds(places, first, last, box):
+    for axis in range(box.shape[1]):
+        box[0, axis] = box[1, axis] = places[first, axis]
+        for i in range(first + 1, last):
+            box[0, axis] = min(box[0, axis], places[i, axis])
+            box[1, axis] = max(box[1, axis], places[i, axis])
+
+
+@njit(nogil=True, cache=True)
+def _misses(a, b, place, box, ring_box, mark, vertex_mark, reach):
+    """Whether no point of a box sees the edge a-b on a line's sender or left of it."""
+    for v in (a, b):
+        if vertex_mark[v] != mark:
+            vertex_mark[v] = mark
+            _reach(place[v], box, reach[v])
+    return (
+        min(reach[a, 0], reach[b, 0]) >= ring_box[1, 0]
+        or min(reach[a, 1], reach[b, 1]) >= ring_box[1, 1]
+        or max(reach[a, 2], reach[b, 2]) <= ring_box[0, 1]
+    )
+
+
+@njit(nogil=True, cache=True)
+def _tile_edges(pieces, box, ring_box, table, frame, mark, marks, out):
+    """Edges of ``pieces`` that may be silhouettes before or left of the sender for some point of a box.
+
+    Their number; one more than there is room for when there was not enough.
+    """
+    starts, _, _, _, edge, ends, edge_piece, turn = table
+    place = frame[3]
+    piece_mark, piece_class, edge_mark, vertex_mark, reach = marks
+    which, base_of, unsettled = out
+    count = 0
+    for p in pieces:
+        for k in range(starts[p], starts[p + 1]):
+            e = edge[k]
+            if edge_mark[e] == mark:
+                continue
+            edge_mark[e] = mark
+            base, unsure = 0, False
+            q0 = q1 = -1
+            for s in range(2):
+                q = edge_piece[e, s]
+                if q < 0 or piece_mark[q] != mark:
+                    continue
+                if piece_class[q] == UNSURE:
+                    unsure = True
+                    if s == 0:
+                        q0 = q
+                    else:
+                        q1 = q
+                else:
+                    base -= turn[e, s] * piece_class[q]
+            if (base == 0 and not unsure) or _misses(
+                ends[e, 0], ends[e, 1], place, box, ring_box, mark, vertex_mark, reach
+            ):
+                continue
+            if count == which.shape[0]:
+                return count + 1
+            which[count], base_of[count] = e, base
+            unsettled[count, 0], unsettled[count, 1] = q0, q1
+            count += 1
+    return count
+
+
+@njit(nogil=True, cache=True)
+def _narrow(count, wide, box, ring_box, table, frame, mark, tile_mark, owned, marks, out):
+    """Of the edges ``wide`` of a box those that matter to the points of a smaller one; their number."""
+    _, piece_polygon, _, _, _, ends, _, turn = table
+    place, plane = frame[3], frame[4]
+    piece_mark, piece_class, _, vertex_mark, _, reach = marks
+    wide_edge, wide_base, wide_unsettled = wide
+    which, base_of, unsettled = out
+    kept = 0
+    for c in range(count):
+        e = wide_edge[c]
+        base, unsure = wide_base[c], False
+        for s in range(2):
+            q = wide_unsettled[c, s]
+            unsettled[kept, s] = -1
+            if q < 0:
+                continue
+            if piece_mark[q] != mark:
+                piece_mark[q] = mark
+                piece_class[q] = UNSURE if owned[piece_polygon[q]] == tile_mark else _side(plane[q], box)
+            if piece_class[q] == UNSURE:
+                unsure = True
+                unsettled[kept, s] = q
+            else:
+                base -= turn[e, s] * piece_class[q]
+        if (base == 0 and not unsure) or _misses(
+            ends[e, 0], ends[e, 1], place, box, ring_box, mark, vertex_mark, reach
+        ):
+            continue
+        which[kept], base_of[kept] = e, base
+        kept += 1
+    return kept
+
+
+@njit(nogil=True, cache=True)
+def _gather_edges(count, narrow, table, frame, mark, marks, out):
+    """Copy edges with their vertices and unsettled pieces, numbered anew; the numbers of these two."""
+    _, _, _, _, _, ends, _, turn = table
+    place, plane = frame[3], frame[4]
+    piece_mark, _, piece_number, vertex_mark, vertex_number, _ = marks
+    which, base_of, unsettled = narrow
+    edge, vertices, pieces, planes = out
+    spots = unsure = 0
+    for c in range(count):
+        e = which[c]
+        edge[c, 2] = base_of[c]
+        for s in range(2):
+            v = ends[e, s]
+            if vertex_mark[v] != mark:
+                vertex_mark[v], vertex_number[v] = mark, spots
+                for axis in range(3):
+                    vertices[axis, spots] = place[v, axis]
+                spots += 1
+            edge[c, s] = vertex_number[v]
+            q = unsettled[c, s]
+            edge[c, 3 + s] = edge[c, 5 + s] = 0
+            if q < 0:
+                continue
+            if piece_mark[q] != mark:
+                piece_mark[q], piece_number[q] = mark, unsure
+                pieces[unsure] = q
+                for k in range(4):
+                    planes[k, unsure] = plane[q, k]
+                unsure += 1
+            edge[c, 3 + s], edge[c, 5 + s] = piece_number[q], -turn[e, s]
+    return spots, unsure
+
+
+@njit(nogil=True, cache=True)
+def _project(vertices, count, px, py, h, y0, dy, lines, over, line, row):
+    """Where vertices lie on the sender's plane, seen from a point: x, and y counted in lines; the line above."""
+    per = 1.0 / dy
+    shift = (py - y0) * per
+    for c in range(count):
+        r = h / (h - vertices[2, c])
+        over[c] = px + (vertices[0, c] - px) * r
+        line[c] = (vertices[1, c] - py) * r * per + shift
+    for c in range(count):
+        row[c] = np.ceil(min(max(line[c], 0.0), lines))
+
+
+@njit(nogil=True, cache=True)
+def _face(planes, count, px, py, h, facing):
+    """1 for each plane that a point lies in front of, -1 for others."""
+    for c in range(count):
+        off = planes[0, c] * px + planes[1, c] * py + planes[2, c] * h - planes[3, c]
+        facing[c] = 1 if off > 0.0 else -1
+
+
+@njit(nogil=True, cache=True)
+def _lay_lines(ring, count, lines, y0, dy, left, right):
+    """Where each line enters and leaves a convex ring."""
+    for k in range(lines):
+        left[k], right[k] = np.inf, -np.inf
+    px, pt = ring[count - 1, 0], (ring[count - 1, 1] - y0) / dy
+    for i in range(count):
+        cx, ct = ring[i, 0], (ring[i, 1] - y0) / dy
+        a, b = math.ceil(min(pt, ct)), math.ceil(max(pt, ct))
+        for k in range(max(a, 0), min(b, lines)):
+            x = px + (k - pt) / (ct - pt) * (cx - px)
+            left[k], right[k] = min(left[k], x), max(right[k], x)
+        px, pt = cx, ct
+
+
+@njit(nogil=True, cache=True)
+def _reaches(ring, count, ring_box, y0, dy, ax, at, bx, bt):
+    """Whether the segment a-b meets the inside of a convex ring; ``at`` and ``bt`` count lines."""
+    ay, by = y0 + at * dy, y0 + bt * dy
+    if (
+        max(ax, bx) <= ring_box[0, 0]
+        or min(ax, bx) >= ring_box[1, 0]
+        or max(ay, by) <= ring_box[0, 1]
+        or min(ay, by) >= ring_box[1, 1]
+    ):
+        return False
+    return not _separated(ring, count, ax, ay, bx, by)
+
+
+@njit(nogil=True, cache=True)
+def _loose_ring(p, starts, vertex, place, top, cut, cut2):
+    """Corners of a piece between the sender's plane and a height, in ``cut``; their number, -1 if too many."""
+    count = starts[p + 1] - starts[p]
+    if count > cut.shape[0]:
+        return -1
+    for k in range(count):
+        v = vertex[starts[p] + k]
+        for axis in range(3):
+            cut[k, axis] = place[v, axis]
+    count = clip_by_plane(cut, count, 0.0, 0.0, -1.0, -top, 0.0, cut2)
+    return clip_by_plane(cut2, count, 0.0, 0.0, 1.0, 0.0, 0.0, cut) if count > 0 else count
+
+
+@njit(nogil=True, cache=True)
+def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, allowed, rays, seed, limit, out, tally):
+    """Visible shares of the points of ``chosen`` tiles whose state is COMPLEX, by lines.
+
+    ``fewest`` lines are drawn, and more (up to ``most``) where the share's error is then above
+    ``allowed``.  Where no silhouette lies before the sender a point is settled for certain, CLEAR or
+    DARK; others become SAMPLED.  Left COMPLEX are points with panes before the sender, with a line of
+    too many crossings, or with so many pieces or edges to look at that ``rays`` rays a point would be
+    cheaper.
+    """
+    points, normals, index, own, tile_start, tile_bounds, tile_normal, tile_offset, tile_own = tiles
+    corners, sender_low, sender_high, sender_normal, sender_own = sender
+    starts, piece_polygon, through, vertex, _, ends, _, _ = table
+    origin, axes, ring, place, plane, height = frame
+    low, high, skip, head, leaf, order, bounds = tree
+    part, share, doubt, state, candidates = out
+
+    pieces, polygons = through.shape[0], 0
+    for p in range(pieces):
+        polygons = max(polygons, piece_polygon[p] + 1)
+    for i in range(own.shape[0]):
+        polygons = max(polygons, own[i] + 1)
+    # Marks say which tile or group has last looked at a piece, an edge, a vertex, a polygon.
+    mark = 0
+    owned = np.zeros(polygons, dtype=np.int64)
+    tile_marks = (
+        np.zeros(pieces, np.int64), np.zeros(pieces, np.int64), np.zeros(ends.shape[0], np.int64),
+        np.zeros(place.shape[0], np.int64), np.empty((place.shape[0], 3)),
+    )  # fmt: skip
+    group_marks = (
+        np.zeros(pieces, np.int64), np.zeros(pieces, np.int64), np.zeros(pieces, np.int64),
+        np.zeros(place.shape[0], np.int64), np.zeros(place.shape[0], np.int64), tile_marks[4],
+    )  # fmt: skip
+    piece_mark, piece_class = tile_marks[0], tile_marks[1]
+    room = min(max(EDGES_A_RAY * rays, 1024), 32768)
+    many_pieces = min(pieces, 4 * room)
+    tile_room = min(ends.shape[0], 8 * room)
+    tile_out = np.empty(tile_room, np.int64), np.empty(tile_room, np.int64), np.empty((tile_room, 2), np.int64)
+    group_out = np.empty(tile_room, np.int64), np.empty(tile_room, np.int64), np.empty((tile_room + 1, 2), np.int64)
+    part_out = np.empty(tile_room, np.int64), np.empty(tile_room, np.int64), np.empty((tile_room + 1, 2), np.int64)
+    group_room = min(room, ends.shape[0])
+    group_edge, group_vertex = np.empty((group_room, 7), np.int64), np.empty((3, 2 * group_room))
+    group_piece, group_plane = np.empty(2 * group_room, np.int64), np.empty((4, 2 * group_room))
+    facing = np.zeros(2 * group_room + 1, np.int64)
+    gathered = (group_edge, group_vertex, group_piece, group_plane)
+    over, line, row = np.empty(2 * group_room), np.empty(2 * group_room), np.empty(2 * group_room)
+    planes = np.empty((MAX_SHAFT_PLANES, 4))
+    found, loose = np.empty(many_pieces, np.int64), np.empty(many_pieces, np.int64)
+    box, ring_box, lit_box = np.empty((2, 3)), np.empty((2, 2)), np.empty((2, 2))
+    lit = np.empty((ring.shape[0] + 1, 2))
+    cut, cut2 = np.empty((64, 3)), np.empty((66, 3))
+    left, right = np.empty(most), np.empty(most)
+    before, many = np.empty(most, np.int64), np.empty(most, np.int64)
+    where, steps = np.empty((most, CROSSINGS)), np.empty((most, CROSSINGS), np.int64)
+    hidden = np.empty((2, most))
+    for axis in range(2):
+        ring_box[0, axis], ring_box[1, axis] = ring[:, axis].min(), ring[:, axis].max()
+    longest = 0
+    for t in chosen:
+        longest = max(longest, tile_start[t + 1] - tile_start[t])
+    places = np.empty((longest, 3))
+
+    for t in chosen:
+        first, last = tile_start[t], tile_start[t + 1]
+        mark += 1
+        tile_mark = mark
+        for i in range(first, last):
+            places[i - first, 0], places[i - first, 1], places[i - first, 2] = _turned(
+                axes, points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+            )
+            if own[i] >= 0 and own[i] != tile_own[t]:
+                owned[own[i]] = tile_mark
+        _bounds(places, 0, last - first, box)
+        asked_points = 0
+        for i in range(first, last):
+            asked_points += state[i] == STATE_COMPLEX
+        if box[0, 2] <= 0.0 or asked_points == 0:
+            continue
+        budget = min(many_pieces, max(EDGES_A_RAY * rays * asked_points, 64))
+        used = tile_shaft(
+            tile_bounds[t], tile_normal[t], tile_offset[t], sender_low, sender_high, sender_normal, corners, slack,
+            planes,
+        )  # fmt: skip
+        tally[SHAFT] += 1
+        met = boxes_meeting_planes(
+            low, high, skip, head, leaf, order, bounds, planes, used, slack, found[:budget], tally
+        )
+        if met > budget:
+            continue
+        kept = apart = 0
+        pane = False
+        for c in range(met):
+            p = found[c]
+            if piece_polygon[p] == sender_own or piece_polygon[p] == tile_own[t]:
+                continue
+            if height[p, 1] <= slack or height[p, 0] >= box[1, 2]:
+                continue
+            pane = pane or through[p] > 0.0
+            if height[p, 0] < -slack or height[p, 1] > (1.0 - NEAR) * box[0, 2]:
+                loose[apart] = p
+                apart += 1
+                continue
+            piece_mark[p] = mark
+            piece_class[p] = UNSURE if owned[piece_polygon[p]] == tile_mark else _side(plane[p], box)
+            found[kept] = p
+            kept += 1
+        if pane:
+            continue
+        if kept + apart == 0:
+            tally[EMPTY] += 1
+        tile_edges = _tile_edges(found[:kept], box, ring_box, table, frame, mark, tile_marks, tile_out)
+        if tile_edges > tile_room:
+            continue
+        start = stop = first
+        narrowed = 0
+        while stop < last:
+            # Groups of neighbours; where they still see many edges, smaller ones inside them.
+            start = stop
+            if (start - first) % GROUP == 0:
+                mark += 1
+                _bounds(places, start - first, min(start + GROUP, last) - first, box)
+                narrowed = _narrow(
+                    tile_edges, tile_out, box, ring_box, table, frame, mark, tile_mark, owned, group_marks, group_out
+                )
+            stop = min(start + (GROUP if narrowed <= CROWDED else PART), last)
+            asked_points = 0
+            for i in range(start, stop):
+                asked_points += state[i] == STATE_COMPLEX
+            if asked_points == 0:
+                continue
+            edges = narrowed
+            mark += 1
+            if narrowed <= CROWDED:
+                if edges > group_room:
+                    continue
+                spots, unsure = _gather_edges(edges, group_out, table, frame, mark, group_marks, gathered)
+            else:
+                _bounds(places, start - first, stop - first, box)
+                edges = _narrow(
+                    narrowed, group_out, box, ring_box, table, frame, mark, tile_mark, owned, group_marks, part_out
+                )
+                if edges > group_room:
+                    continue
+                mark += 1
+                spots, unsure = _gather_edges(edges, part_out, table, frame, mark, group_marks, gathered)
+            for i in range(start, stop):
+                if state[i] != STATE_COMPLEX:
+                    continue
+                px, py, h = places[i - first, 0], places[i - first, 1], places[i - first, 2]
+                nx, ny, nz = _turned(axes, normals[i, 0], normals[i, 1], normals[i, 2])
+                corners_lit = _clip_ring(ring, nx, ny, nx * px + ny * py + nz * h, lit)
+                if corners_lit < 3:
+                    continue
+                _bounds(lit, 0, corners_lit, lit_box)
+                if not lit_box[1, 1] > lit_box[0, 1]:
+                    continue
+                offset = shift(index[i], seed)[0]
+                _face(group_plane, unsure, px, py, h, facing)
+                if tile_own[t] == DIFFERENT:
+                    for c in range(unsure):
+                        if piece_polygon[group_piece[c]] == own[i]:
+                            facing[c] = 0
+                lines, dark, error = fewest, 0.0, np.inf
+                meets = fits = True
+                while True:
+                    dy = (lit_box[1, 1] - lit_box[0, 1]) / lines
+                    y0 = lit_box[0, 1] + offset * dy
+                    _lay_lines(lit, corners_lit, lines, y0, dy, left, right)
+                    for k in range(lines):
+                        before[k] = many[k] = 0
+                    _project(group_vertex, spots, px, py, h, y0, dy, lines, over, line, row)
+                    for c in range(edges):
+                        a, b = group_edge[c, 0], group_edge[c, 1]
+                        change = (
+                            group_edge[c, 2]
+                            + group_edge[c, 5] * facing[group_edge[c, 3]]
+                            + group_edge[c, 6] * facing[group_edge[c, 4]]
+                        )
+                        if (change != 0) & (row[a] != row[b]):
+                            fits = fits and _cross(
+                                over[a], line[a], over[b], line[b], change, lines, left, right, before, many, where,
+                                steps,
+                            )  # fmt: skip
+                    meets = False
+                    for c in range(apart):
+                        p = loose[c]
+                        if piece_polygon[p] == own[i] or height[p, 0] >= h:
+                            continue
+                        count = _loose_ring(p, starts, vertex, place, (1.0 - NEAR) * h, cut, cut2)
+                        fits = fits and count >= 0
+                        off = plane[p, 0] * px + plane[p, 1] * py + plane[p, 2] * h - plane[p, 3]
+                        change = -1 if off > 0.0 else 1
+                        for k in range(count):
+                            r = h / (h - cut[k, 2])
+                            cut2[k, 0] = px + (cut[k, 0] - px) * r
+                            cut2[k, 1] = (py + (cut[k, 1] - py) * r - y0) / dy
+                        for k in range(count):
+                            j = k + 1 if k + 1 < count else 0
+                            ax, at, bx, bt = cut2[k, 0], cut2[k, 1], cut2[j, 0], cut2[j, 1]
+                            meets = meets or _reaches(lit, corners_lit, lit_box, y0, dy, ax, at, bx, bt)
+                            fits = fits and _cross(
+                                ax, at, bx, bt, change, lines, left, right, before, many, where, steps
+                            )
+                    tally[EDGES] += edges
+                    if not fits:
+                        break
+                    uncut = True
+                    for k in range(lines):
+                        uncut = uncut and many[k] == 0
+                    meets = meets or not uncut
+                    if not meets:
+                        # Does a silhouette lie between the lines?
+                        for c in range(edges):
+                            a, b = group_edge[c, 0], group_edge[c, 1]
+                            change = (
+                                group_edge[c, 2]
+                                + group_edge[c, 5] * facing[group_edge[c, 3]]
+                                + group_edge[c, 6] * facing[group_edge[c, 4]]
+                            )
+                            if change != 0 and _reaches(
+                                lit, corners_lit, lit_box, y0, dy, over[a], line[a], over[b], line[b]
+                            ):
+                                meets = True
+                                break
+                        if not meets:
+                            break
+                    dark, error = _sum_lines(
+                        lines, y0, dy, px, py, h, nx, ny, nz, left, right, before, many, where, steps, hidden
+                    )
+                    tally[LINES] += lines
+                    if lines == most or (error <= SURE * allowed and not uncut):
+                        break
+                    more = 4.0 if uncut else min(max((error / allowed) ** (2.0 / 3.0), 1.5), 4.0)
+                    lines = min(math.ceil(more * lines), most)
+                if not fits:
+                    continue
+                if not meets:
+                    hiding = 0
+                    for k in range(lines):
+                        hiding += before[k] > 0
+                    if hiding == 0:
+                        share[i], state[i], candidates[i] = part[i], STATE_CLEAR, 0
+                        tally[CLEAR] += 1
+                        continue
+                    if hiding == lines:
+                        share[i], state[i], candidates[i] = 0.0, STATE_DARK, limit + 1
+                        tally[DARK] += 1
+                        continue
+                candidates[i] = limit + 1
+                tally[COMPLEX] += 1
+                share[i], doubt[i] = (1.0 - dark) * part[i], error * part[i]
+                state[i] = STATE_SAMPLED
