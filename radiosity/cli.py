@@ -115,7 +115,19 @@ def main() -> None:
     help="Stop when the bound on the light still missing falls below this share.",
 )
 @click.option(
-    "--method", type=click.Choice(["auto", "progressive", "direct"]), default="auto", show_default=True, help="Solver."
+    "--method",
+    type=click.Choice(["auto", "progressive", "direct", "hierarchical"]),
+    default="auto",
+    show_default=True,
+    help="Solver.",
+)
+@click.option(
+    "--link-error",
+    type=click.FloatRange(min=0, min_open=True),
+    callback=_finite,
+    metavar="E",
+    help="Of hierarchical: what one link may be off, as a share of the mean irradiance.  [default: 0.001, or what"
+    " --elements allows]",
 )
 @click.option(
     "--error",
@@ -146,6 +158,7 @@ def solve(
     method: str,
     error: float | None,
     budget_seconds: float | None,
+    link_error: float | None,
     workers: int | None,
     seed: int,
     json_path: str | None,
@@ -180,6 +193,7 @@ def solve(
 
         options: dict[str, Any] = {
             "method": method,
+            "link_error": link_error,
             "elements": elements,
             "max_edge": max_edge,
             "rays": rays,

@@ -277,7 +277,7 @@ def forecast_elements(scene: Scene, edge: float, split: int = 2) -> int:
             longest = np.linalg.norm(np.roll(tri, -1, axis=1) - tri, axis=2).max(axis=1)
             n = np.maximum(1, np.ceil(longest / edge - 1e-9))
             n = np.where(n > 1, split * np.ceil(n / split), 1) ** 2
-            small = _small_facets(surface, edge)
+            small = small_facets(surface, edge)
             if len(small):
                 n[small] = 0
                 vector = np.cross(tri[small, 1] - tri[small, 0], tri[small, 2] - tri[small, 0])
@@ -313,7 +313,7 @@ def _edge_for(scene: Scene, geometry: Geometry, elements: int, split: int) -> fl
     return high
 
 
-def _small_facets(surface: Surface, edge: float) -> IntArray:
+def small_facets(surface: Surface, edge: float) -> IntArray:
     """Faces of a tessellated surface that are no larger than an element: those are clustered."""
     sizes = np.diff(surface.ring_offsets)
     if surface.face_count < TESSELLATED or len(sizes) != surface.face_count:
@@ -400,7 +400,7 @@ def build_mesh(
         faces = range(surface.face_count)
         sizes = np.diff(surface.ring_offsets)
         fine: set[int] = set()
-        small = _small_facets(surface, edge) if cluster else np.empty(0, np.int64)
+        small = small_facets(surface, edge) if cluster else np.empty(0, np.int64)
         if len(small):
             fine = set(small.tolist())
             first = surface.ring_offsets[small]

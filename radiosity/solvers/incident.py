@@ -20,7 +20,7 @@ from workbench.scene.model import Light, Scene
 from workbench.shadow.occlusion import Shader
 from workbench.shadow.sky import SkyLight
 
-__all__ = ["incident_irradiance"]
+__all__ = ["incident_irradiance", "light_spread"]
 
 FloatArray = NDArray[np.float64]
 
@@ -210,4 +210,37 @@ def incident_irradiance(
         for first in range(0, mesh.element_count, step):
             last = min(first + step, mesh.element_count)
             out[first:last] += _from_sky(mesh, first, last, count, sky_rays, seed, sky, shader)
+    return out
+
+
+def light_spread(
+    scene: Scene, mesh: PatchMesh, tracer: EmbreeAccelerator, *, points: int = 16, seed: int = 0
+) -> FloatArray:
+    """How much the light of lights without surface varies over each element.
+
+    Parameters
+    ----------
+    scene, mesh : Scene, PatchMesh
+    tracer : EmbreeAccelerator
+        Over the scene's geometry.
+    points : int
+        Points an element.
+    seed : int
+
+    Returns
+    -------
+    (n, bands) float
+        Standard deviation of the irradiance over the element. [W m-2]
+    """
+    out = np.zeros((mesh.element_count, mesh.bands))
+    step = max(1, BLOCK_RAYS // points)
+    for first in range(0, mesh.element_count, step):
+        last = min(first + step, mesh.element_count)
+        where, normals = _points(mesh, first, last, points, seed)
+        total = np.zeros((last - first, points, mesh.bands))
+        for light in scene.lights:
+            samples = POINTS if light.kind == "linear" else 1
+            value = sum(_from_light(light, where, normals, tracer, k) for k in range(samples)) / samples
+            total += np.asarray(value).reshape(-1, points, 1) * light.power
+        out[first:last] = total.std(axis=1)
     return out

@@ -12,6 +12,7 @@ import numpy as np
 from radiosity.form_factors.bundle import LinkSettings, ReceiverBundles
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
 from radiosity.solvers.direct import solve_direct
+from radiosity.solvers.hierarchical import solve_hierarchical
 from radiosity.solvers.incident import incident_irradiance
 from radiosity.solvers.progressive import shoot_until
 from radiosity.solvers.solution import Checkpoint, EnergyBook, Progress, Solution
@@ -23,9 +24,10 @@ from workbench.scene.model import Scene
 
 __all__ = ["solve"]
 
-METHODS = ("auto", "progressive", "direct")
+METHODS = ("auto", "progressive", "direct", "hierarchical")
 
 DEFAULT_ELEMENTS = 2000
+DEFAULT_LINK_ERROR = 1e-3
 DIRECT_ELEMENTS = 64
 """Scenes of at most this many elements are solved directly."""
 EXACT_ELEMENTS = 12
@@ -102,6 +104,17 @@ def _forecast(scene: Scene, elements: int | None, max_edge: float | None, method
         require_memory(32.0 * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", advice)
 
 
+def _note_materials(geometry: Geometry, record: RunRecord) -> None:
+    """Say in the record what of the materials a solve leaves out."""
+    if any(material.specular.any() for material in geometry.surface_material):
+        record.choices["specular"] = "mirror reflection is left to pictures; its share is absorbed"
+    if geometry.polygon_transmittance.any():
+        record.choices["transmittance"] = (
+            "panes dim what is cut exactly; where rays decide (long candidate lists, clusters, lights without surface)"
+            " they block"
+        )
+
+
 def _start(scene: Scene, mesh: PatchMesh, incident: np.ndarray, record: RunRecord) -> Solution:
     """The solution before the first shot: emission, and light from outside the mesh reflected once."""
     area = mesh.element_area
@@ -158,6 +171,8 @@ def solve(
     rays: int = 16,
     tolerance: float = 0.01,
     form_factor_error: float | None = None,
+    link_error: float | None = None,
+    direct_in_mesh: bool = True,
     workers: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -171,7 +186,8 @@ def solve(
     scene : Scene
         From :func:`workbench.load` or built in code.
     method : str
-        ``progressive`` (shooting), ``direct`` (full matrix; small scenes), or ``auto``.
+        ``progressive`` (shooting), ``hierarchical`` (links at the coarsest level that will do, elements
+        where the light changes), ``direct`` (full matrix; small scenes), or ``auto``.
     elements : int, optional
         About how many elements; 1 gives one a polygon.  Default 2,000 (or one a polygon, if there
         are more polygons).
@@ -183,6 +199,12 @@ def solve(
         Stop when the bound on the light still missing falls below this share of all light.
     form_factor_error : float, optional
         Wanted relative error of each form factor; chosen from the number of elements by default.
+    link_error : float, optional
+        Of ``hierarchical``: the error that one link may leave, see
+        :func:`radiosity.solvers.hierarchical.solve_hierarchical`.  With ``elements`` by default as small as
+        their number allows, without it 1e-3.
+    direct_in_mesh : bool
+        Of ``hierarchical``: whether elements resolve shadows, or leave direct light to points and pictures.
     workers : int, optional
         Threads, all cores by default.  The answer does not depend on it.
     seed : int
@@ -212,8 +234,13 @@ def solve(
     """
     count = workers if workers is not None else len(os.sched_getaffinity(0))
     _check(scene, method, elements, max_edge, rays, tolerance, count)
-    if elements is None and max_edge is None:
-        elements = DEFAULT_ELEMENTS
+    if method != "hierarchical":
+        if link_error is not None or not direct_in_mesh:
+            raise OptionError(f"link_error and direct_in_mesh: found with method {method!r}, expected 'hierarchical'")
+        if elements is None and max_edge is None:
+            elements = DEFAULT_ELEMENTS
+    elif link_error is None and elements is None:
+        link_error = DEFAULT_LINK_ERROR
     _forecast(scene, elements, max_edge, method)
     settings: dict[str, Any] = {
         "scene": scene.name,
@@ -223,12 +250,33 @@ def solve(
         "rays": rays,
         "tolerance": tolerance,
         "form_factor_error": form_factor_error,
+        "link_error": link_error,
+        "direct_in_mesh": direct_in_mesh,
         "workers": count,
         "seed": seed,
     }
     record = RunRecord(command="solve", settings=settings)
+    if form_factor_error is not None and not 0 < form_factor_error < 1:
+        raise OptionError(f"form_factor_error: found {form_factor_error}, expected a number between 0 and 1")
     with record.stage("mesh"):
         geometry = Geometry.from_scene(scene)
+    _note_materials(geometry, record)
+    if method == "hierarchical":
+        return solve_hierarchical(
+            scene,
+            geometry,
+            record,
+            link_error=link_error,
+            max_elements=elements,
+            max_edge=max_edge,
+            direct_in_mesh=direct_in_mesh,
+            form_factor_error=form_factor_error,
+            tolerance=min(tolerance, 1e-4),
+            workers=count,
+            seed=seed,
+            progress=progress,
+        )
+    with record.stage("mesh"):
         mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge)
     n = mesh.element_count
     if method == "auto":
@@ -241,16 +289,7 @@ def solve(
         n = mesh.element_count
     _forecast(scene, n, None, method)
     error = form_factor_error if form_factor_error is not None else _form_factor_error(n, method)
-    if not 0 < error < 1:
-        raise OptionError(f"form_factor_error: found {error}, expected a number between 0 and 1")
     record.choices["form_factor_error"] = f"{error:g}"
-    if any(surface.material.specular.any() for surface in scene.surfaces):
-        record.choices["specular"] = "mirror reflection is left to pictures; its share is absorbed"
-    if geometry.polygon_transmittance.any():
-        record.choices["transmittance"] = (
-            "panes dim what is cut exactly; where rays decide (long candidate lists, clusters, lights without surface)"
-            " they block"
-        )
     with record.stage("prepare"):
         bundles = ReceiverBundles(geometry, mesh, _settings(error, rays, seed, mesh.patch_count), count)
     try:

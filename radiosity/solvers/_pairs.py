@@ -1,0 +1,604 @@
+"""Links of hierarchical radiosity as kernels: settle, measure, judge and finish whole frontiers of pairs.
+
+A pair joins two nodes of the tree.  What is kept of it is the exchange area ``G = A_a F_ab = A_b F_ba``,
+so reciprocity holds by construction, and by how much the form factor varies over each end.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from radiosity.form_factors._links import (
+    MAX_CANDIDATES,
+    _cell_points,
+    _element_integral,
+    _group_is_dark,
+    _on_one_side,
+    _point_share,
+    _sampled_share,
+    open_share,
+)
+from radiosity.form_factors._sampling import place_on_pieces, stream
+from radiosity.form_factors.analytic import pair_exchange
+from radiosity.hierarchy import NODE_SAMPLES
+from workbench.accel.box_tree import boxes_meeting_planes
+from workbench.culling.hull_shaft import hull_shaft
+from workbench.culling.plane_vertex import outside_planes
+from workbench.culling.shaft import box_shaft
+from workbench.culling.tally import CLEAR as TALLY_CLEAR
+from workbench.culling.tally import CLOSED, COMPLEX, DARK, EMPTY, HORIZON, LINK, SHAFT, SHAFT_CULL, SHAFT_TEST
+
+UNSEEN, CLEAR, CUT, RAYS, NEAR = 0, 1, 2, 3, 4
+"""What is known of a pair: nothing yet, NOT_INSHADOW, COMPLEX with a short list, COMPLEX left to rays, and
+a cluster so near that its samples do not tell what it sends (also left to rays)."""
+
+DROPPED = -1
+"""A pair that exchanges nothing: behind a horizon, or INSHADOW."""
+
+PART_OF_CLEAR, PART_OF_CUT = -2, -3
+"""A pair not measured yet, of which the pair it is part of is known."""
+
+KEPT = 64
+"""Longest candidate list kept with a pair; where there are more, a part asks the box tree itself."""
+CUTS = 40
+"""Longest candidate list that is cut."""
+SUMMED = 16
+"""Pieces of a cluster that are seen one by one; with more, its samples stand for it."""
+DIP = 0.5
+"""Depth of a shadow, as a share of the open form factor, that may hide between points that agree."""
+
+
+@njit(nogil=True, cache=True)
+def node_points(node, tree, cell, out):
+    """Rows (x, y, z, weight, normal) that stand for a node; their number.
+
+    The 2 x 2 Gauss rule of a quad, the 3-point rule of a triangle, else the node's samples.
+    """
+    row = tree.sample[node]
+    if row >= 0:
+        for k in range(NODE_SAMPLES):
+            for axis in range(3):
+                out[k, axis] = tree.samples[row, k, axis]
+                out[k, 4 + axis] = tree.sample_normals[row, k, axis]
+            out[k, 3] = tree.area[node] / NODE_SAMPLES
+        return NODE_SAMPLES
+    a, b = tree.starts[tree.piece0[node]], tree.starts[tree.piece0[node] + 1]
+    for i in range(a, b):
+        for axis in range(3):
+            cell[i - a, axis] = tree.corners[i, axis]
+    count = _cell_points(cell, b - a == 4, out)
+    for k in range(count):
+        for axis in range(3):
+            out[k, 4 + axis] = tree.normal[node, axis]
+    return count
+
+
+@njit(nogil=True, cache=True)
+def _views(points, count, node, tree, slack, values):
+    """Unoccluded form factor from each point to a node; the weighted mean and standard deviation."""
+    p0, p1 = tree.piece0[node], tree.piece1[node]
+    row = tree.sample[node]
+    summed = tree.flat[node] == 1 or p1 - p0 <= SUMMED
+    total = square = weight = 0.0
+    for k in range(count):
+        value = 0.0
+        if summed:
+            for p in range(p0, p1):
+                value += max(
+                    open_share(
+                        points[k, 0], points[k, 1], points[k, 2], points[k, 4], points[k, 5], points[k, 6],
+                        tree.corners, tree.starts[p], tree.starts[p + 1], tree.piece_normal, p, slack,
+                    ),
+                    0.0,
+                )  # fmt: skip
+        else:
+            value = _sampled_share(
+                points[k, 0:3], points[k, 4:7], tree.samples[row], tree.sample_normals[row], tree.area[node]
+            )
+        values[k] = value
+        w = points[k, 3]
+        total += w * value
+        square += w * value * value
+        weight += w
+    mean = total / weight
+    return mean, math.sqrt(max(square / weight - mean * mean, 0.0))
+
+
+@njit(nogil=True, cache=True)
+def _ahead(node, other, tree, slack):
+    """Whether any part of ``other`` may lie before the plane of a flat node."""
+    nx, ny, nz = tree.normal[node, 0], tree.normal[node, 1], tree.normal[node, 2]
+    s = tree.starts[tree.piece0[node]]
+    d = nx * tree.corners[s, 0] + ny * tree.corners[s, 1] + nz * tree.corners[s, 2] + slack
+    if tree.piece1[other] - tree.piece0[other] == 1:
+        p = tree.piece0[other]
+        for i in range(tree.starts[p], tree.starts[p + 1]):
+            if nx * tree.corners[i, 0] + ny * tree.corners[i, 1] + nz * tree.corners[i, 2] > d:
+                return True
+        return False
+    reach = nx * (tree.high[other, 0] if nx > 0.0 else tree.low[other, 0])
+    reach += ny * (tree.high[other, 1] if ny > 0.0 else tree.low[other, 1])
+    reach += nz * (tree.high[other, 2] if nz > 0.0 else tree.low[other, 2])
+    return reach > d
+
+
+@njit(nogil=True, cache=True)
+def _turned_away(node, other, tree):
+    """Whether every normal of a cluster points away from all of ``other``."""
+    reach = tree.cone[node] + 0.5 * math.pi
+    if reach >= math.pi:
+        return False
+    dx = dy = dz = radius = square = 0.0
+    dx = 0.5 * (tree.low[other, 0] + tree.high[other, 0] - tree.low[node, 0] - tree.high[node, 0])
+    dy = 0.5 * (tree.low[other, 1] + tree.high[other, 1] - tree.low[node, 1] - tree.high[node, 1])
+    dz = 0.5 * (tree.low[other, 2] + tree.high[other, 2] - tree.low[node, 2] - tree.high[node, 2])
+    square = dx * dx + dy * dy + dz * dz
+    one = two = 0.0
+    for axis in range(3):
+        side = tree.high[node, axis] - tree.low[node, axis]
+        one += side * side
+        side = tree.high[other, axis] - tree.low[other, axis]
+        two += side * side
+    radius = 0.5 * (math.sqrt(one) + math.sqrt(two))
+    if square <= radius * radius:
+        return False
+    distance = math.sqrt(square)
+    cosine = (dx * tree.normal[node, 0] + dy * tree.normal[node, 1] + dz * tree.normal[node, 2]) / distance
+    return math.acos(min(max(cosine, -1.0), 1.0)) > reach + math.asin(radius / distance) + 1e-9
+
+
+@njit(nogil=True, cache=True)
+def _gap(a, b, tree):
+    """Distance of the boxes of two nodes."""
+    square = 0.0
+    for axis in range(3):
+        off = max(tree.low[b, axis] - tree.high[a, axis], tree.low[a, axis] - tree.high[b, axis], 0.0)
+        square += off * off
+    return math.sqrt(square)
+
+
+@njit(nogil=True, cache=True)
+def candidates(a, b, tree, geo, given, count, found, planes, tally):
+    """Pieces that may come between two flat nodes, from ``given[:count]``; -1 if there are too many.
+
+    With ``count`` below zero all polygons are asked, through the box tree.  The shaft is the hull of
+    two single polygons (of the boxes of others), cut by both ends' own planes: what lies behind
+    either blocks nothing.  Touching hides a null set, so the planes move inward by a hair.
+    """
+    pa, pb = tree.piece0[a], tree.piece0[b]
+    a0, a1, b0, b1 = tree.starts[pa], tree.starts[pa + 1], tree.starts[pb], tree.starts[pb + 1]
+    single = tree.piece1[a] == pa + 1 and tree.piece1[b] == pb + 1
+    if single:
+        used = hull_shaft(tree.corners, a0, a1, tree.corners, b0, b1, planes)
+    else:
+        used = box_shaft(tree.low[a], tree.high[a], tree.low[b], tree.high[b], planes)
+    used = min(used, planes.shape[0] - 2)
+    for end in range(2):
+        node, s = (a, a0) if end == 0 else (b, b0)
+        d = 0.0
+        for axis in range(3):
+            planes[used, axis] = tree.normal[node, axis]
+            d += tree.normal[node, axis] * tree.corners[s, axis]
+        planes[used, 3] = d
+        used += 1
+    for k in range(used):
+        planes[k, 3] += 2.0 * geo.slack
+    tally[SHAFT] += 1
+    many = count
+    if count < 0:
+        many = boxes_meeting_planes(
+            geo.low, geo.high, geo.skip, geo.first, geo.count, geo.order, geo.bounds, planes, used, geo.slack, found,
+            tally,
+        )  # fmt: skip
+        if many > found.shape[0]:
+            return -1
+    kept = 0
+    for i in range(many):
+        piece = found[i] if count < 0 else given[i]
+        polygon = geo.piece_polygon[piece]
+        if polygon == tree.polygon[a] or polygon == tree.polygon[b]:
+            continue
+        tally[SHAFT_TEST] += 1
+        if outside_planes(geo.corners, geo.piece_start[piece], geo.piece_start[piece + 1], planes, used, geo.slack):
+            tally[SHAFT_CULL] += 1
+            continue
+        # A wall that has both ends in front of it (or both behind) comes between neither.
+        if single and _on_one_side(
+            geo.normal[piece, 0], geo.normal[piece, 1], geo.normal[piece, 2], geo.offset[piece], tree.corners, a0, a1,
+            b0, b1, geo.slack,
+        ):  # fmt: skip
+            tally[SHAFT_CULL] += 1
+            continue
+        found[kept] = piece
+        kept += 1
+    if kept == 0:
+        tally[EMPTY] += 1
+    return kept
+
+
+@njit(nogil=True, cache=True)
+def _receives_at_a(a, b, area, bright):
+    """Whether points on the first end measure visibility: where an error does more harm."""
+    return bright[b] * math.sqrt(area[b]) >= bright[a] * math.sqrt(area[a])
+
+
+@njit(nogil=True, cache=True)
+def _share_at(points, count, x, y, tree, geo, found, many, limit, work, values, tally):
+    """Visible share of node ``y`` from points on ``x``: the share and the deviation of the form factor.
+
+    The share is below zero if a point needs rays.
+    """
+    seen = whole = square = weight = 0.0
+    for k in range(count):
+        value, clear = _point_share(
+            points[k, 0], points[k, 1], points[k, 2], points[k, 4], points[k, 5], points[k, 6], tree.polygon[x],
+            tree.polygon[y], tree.piece0[y], tree.piece1[y], tree.corners, tree.starts, tree.piece_normal, geo.corners,
+            geo.piece_start, geo.piece_polygon, geo.through, geo.slack, found, many, limit, work.planes, work.picked,
+            work.boxes, work.sizes, work.weights, work.cut, tally,
+        )  # fmt: skip
+        if value < 0.0:
+            return -1.0, 0.0
+        values[k] = value
+        w = points[k, 3]
+        seen += w * value
+        whole += w * clear
+        square += w * value * value
+        weight += w
+    mean = seen / weight
+    deviation = math.sqrt(max(square / weight - mean * mean, 0.0))
+    return (seen / whole if whole > 0.0 else 0.5), deviation
+
+
+@njit(nogil=True, cache=True)
+def measure(
+    first, last, a, b, state, offset, count, pool, bright, tree, geo, piece_area, limit, exchange, vary_a, vary_b,
+    doubt, new_count, new_pool, work, tally,
+):  # fmt: skip
+    """Measure the pairs ``first..last``: exchange area, variation of F over each end, doubt of the exchange.
+
+    ``state``, ``offset``, ``count`` and the variations come from the pair that was split; the list of candidates is
+    narrowed into ``new_pool``, of which the used length is returned, and ``new_count`` (-1: too many
+    to keep).  Pairs left to rays get their unoccluded exchange area.
+    """
+    planes = np.empty((40, 4))
+    pa, pb = np.empty((NODE_SAMPLES, 7)), np.empty((NODE_SAMPLES, 7))
+    va, vb = np.empty(NODE_SAMPLES), np.empty(NODE_SAMPLES)
+    cell = np.empty((4, 3))
+    given = np.empty(MAX_CANDIDATES, dtype=np.int64)
+    position = 0
+    for i in range(first, last):
+        x, y = a[i], b[i]
+        new_count[i] = -1
+        exchange[i] = doubt[i] = 0.0
+        if x == y:
+            # A cluster with itself: no more than a cap of a sphere whose normals spread as far.
+            bound = 0.5 * (1.0 - math.cos(tree.cone[x]))
+            exchange[i] = bound * tree.area[x]
+            vary_a[i] = vary_b[i] = bound
+            state[i] = RAYS
+            continue
+        flat_a, flat_b = tree.flat[x] == 1, tree.flat[y] == 1
+        # A node's plane is exact: what only touches it exchanges nothing.
+        if (
+            (flat_a and not _ahead(x, y, tree, geo.slack)) or (flat_b and not _ahead(y, x, tree, geo.slack))
+            or (not flat_a and _turned_away(x, y, tree)) or (not flat_b and _turned_away(y, x, tree))
+        ):  # fmt: skip
+            tally[HORIZON] += 1
+            state[i] = DROPPED
+            continue
+        many = 0
+        both = flat_a and flat_b
+        if both and state[i] != PART_OF_CLEAR:
+            known = count[i]
+            for c in range(known):
+                given[c] = pool[offset[i] + c]
+            many = candidates(x, y, tree, geo, given, known, work.found, planes, tally)
+            if (
+                many > 0 and tree.piece1[x] - tree.piece0[x] == 1 and tree.piece1[y] - tree.piece0[y] == 1
+                and _group_is_dark(
+                    geo.corners, geo.piece_start, geo.through, work.found, many, tree.corners,
+                    tree.starts[tree.piece0[x]], tree.starts[tree.piece0[x] + 1], tree.starts[tree.piece0[y]],
+                    tree.starts[tree.piece0[y] + 1], geo.slack,
+                )
+            ):  # fmt: skip
+                tally[DARK] += 1
+                state[i] = DROPPED
+                continue
+        tally[LINK] += 1
+        tally[CLOSED] += 1
+        na = node_points(x, tree, cell, pa)
+        nb = node_points(y, tree, cell, pb)
+        from_a, std_a = _views(pa, na, y, tree, geo.slack, va)
+        from_b, std_b = _views(pb, nb, x, tree, geo.slack, vb)
+        one, two = from_a * tree.area[x], from_b * tree.area[y]
+        off = abs(one - two)
+        # The rule whose values agree better among themselves is the better one.
+        value = one if std_a * two <= std_b * one else two
+        if both and min(one, two) <= 0.0:
+            # Seen by no point, yet before each other's planes: a sliver above a horizon.
+            value = 0.0
+            for p in range(tree.piece0[x], tree.piece1[x]):
+                for q in range(tree.piece0[y], tree.piece1[y]):
+                    value += pair_exchange(
+                        tree.corners, tree.starts[p], tree.starts[p + 1], tree.piece_normal[p], tree.corners,
+                        tree.starts[q], tree.starts[q + 1], tree.piece_normal[q], 1e-3 * off + 1e-15 * tree.area[x],
+                        work.pair,
+                    )  # fmt: skip
+            std_a = max(std_a, value / tree.area[x])
+            std_b = max(std_b, value / tree.area[y])
+            off = 0.0
+        exchange[i] = value
+        doubt[i] = 0.5 * off
+        open_a, open_b = value / tree.area[x], value / tree.area[y]
+        open_vary_a, open_vary_b = max(std_a, 0.5 * off / tree.area[x]), max(std_b, 0.5 * off / tree.area[y])
+        if not both:
+            vary_a[i], vary_b[i] = open_vary_a, open_vary_b
+            gap = _gap(x, y, tree)
+            extent = max(0.0 if flat_a else tree.size[x], 0.0 if flat_b else tree.size[y])
+            if gap < extent:
+                # Too near for samples to tell: all that could arrive is in doubt.
+                high = math.pi * gap * gap
+                vary_a[i] = 1.0 if high <= tree.area[y] else tree.area[y] / high
+                vary_b[i] = 1.0 if high <= tree.area[x] else tree.area[x] / high
+                state[i] = NEAR
+            elif value == 0.0:
+                state[i] = DROPPED
+                continue
+            else:
+                state[i] = RAYS
+            tally[COMPLEX] += 1
+            continue
+        if value <= 0.0:
+            state[i] = DROPPED
+            continue
+        if many == 0:
+            state[i] = CLEAR
+            vary_a[i], vary_b[i] = open_vary_a, open_vary_b
+            new_count[i] = 0
+            tally[TALLY_CLEAR] += 1
+            continue
+        if 0 < many <= KEPT:
+            for c in range(many):
+                new_pool[position + c] = work.found[c]
+            position += many
+            new_count[i] = many
+        if 0 < many <= CUTS:
+            at_a = _receives_at_a(x, y, tree.area, bright)
+            if at_a:
+                share, deviation = _share_at(
+                    pa, na, x, y, tree, geo, work.found, many, limit, work, va, tally
+                )  # fmt: skip
+            else:
+                share, deviation = _share_at(
+                    pb, nb, y, x, tree, geo, work.found, many, limit, work, vb, tally
+                )  # fmt: skip
+            if share >= 0.0:
+                share = min(share, 1.0)
+                exchange[i] = value * share
+                own, other = (open_a, open_b) if at_a else (open_b, open_a)
+                area = tree.area[x] if at_a else tree.area[y]
+                if share <= 0.0 or share > 1.0 - 1e-9:
+                    # Points that agree may hide a shadow, or a gap, as small as what lies between.
+                    blockers = 0.0
+                    for c in range(many):
+                        blockers += piece_area[work.found[c]]
+                    hidden = DIP * own * math.sqrt(min(blockers / area, 1.0))
+                    if state[i] == PART_OF_CUT:
+                        # The whole was looked at, too: what hides from both is smaller.
+                        hidden = min(hidden, 0.5 * (vary_a[i] if at_a else vary_b[i]))
+                    deviation = max(deviation, hidden)
+                state[i] = CUT
+                doubt[i] = doubt[i] * share + 0.35 * deviation * area
+                # The other end's visibility is taken to vary as much, relative to its form factor.
+                spread = other * deviation / own
+                if at_a:
+                    vary_a[i] = max(deviation, 0.5 * off / tree.area[x] * share)
+                    vary_b[i] = max(std_b * share, spread)
+                else:
+                    vary_b[i] = max(deviation, 0.5 * off / tree.area[y] * share)
+                    vary_a[i] = max(std_a * share, spread)
+                continue
+        vary_a[i], vary_b[i] = open_vary_a, open_vary_b
+        state[i] = RAYS
+        tally[COMPLEX] += 1
+    return position
+
+
+@njit(nogil=True, cache=True)
+def pair_rays(
+    pairs, counts, a, b, seed, tree, offset, centre, scale, starts, origins, directions, weights
+):  # fmt: skip
+    """Rays between random points of the two ends of each pair, in Embree's unit frame.
+
+    Each carries the weight cos cos / r^2, softened below the distance at which the ray's own share of
+    the area would fill the view; pairs of points that do not face each other get no ray.
+    Returns the number of rays; those of pair ``i`` are ``starts[i]:starts[i + 1]``.
+    """
+    p, q = np.empty(3), np.empty(3)
+    # Generalised golden ratio in four dimensions (M. Roberts 2018).
+    g = 1.1673039782614187
+    row = 0
+    for i in range(pairs.shape[0]):
+        starts[i] = row
+        x, y = a[pairs[i]], b[pairs[i]]
+        h = stream(x, y, seed)
+        s1 = np.float64(h & np.uint64(0xFFFF)) / 65536.0
+        s2 = np.float64((h >> np.uint64(16)) & np.uint64(0xFFFF)) / 65536.0
+        s3 = np.float64((h >> np.uint64(32)) & np.uint64(0xFFFF)) / 65536.0
+        s4 = np.float64((h >> np.uint64(48)) & np.uint64(0xFFFF)) / 65536.0
+        soft = min(tree.area[x], tree.area[y]) / (math.pi * counts[i])
+        for k in range(counts[i]):
+            t = k + 0.5
+            own = place_on_pieces(
+                tree.corners, tree.starts, tree.piece0[x], tree.piece1[x], tree.area[x], (s1 + t / g) % 1.0,
+                (s2 + t / g**2) % 1.0, p,
+            )  # fmt: skip
+            other = place_on_pieces(
+                tree.corners, tree.starts, tree.piece0[y], tree.piece1[y], tree.area[y], (s3 + t / g**3) % 1.0,
+                (s4 + t / g**4) % 1.0, q,
+            )  # fmt: skip
+            n, m = tree.piece_normal[own], tree.piece_normal[other]
+            dx, dy, dz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+            cx = dx * n[0] + dy * n[1] + dz * n[2]
+            cy = -(dx * m[0] + dy * m[1] + dz * m[2])
+            if cx <= 0.0 or cy <= 0.0:
+                continue
+            square = dx * dx + dy * dy + dz * dz
+            weights[row] = cx * cy / (square * (square + soft))
+            sx, sy, sz = p[0] + offset * n[0], p[1] + offset * n[1], p[2] + offset * n[2]
+            origins[row, 0] = (sx - centre[0]) * scale
+            origins[row, 1] = (sy - centre[1]) * scale
+            origins[row, 2] = (sz - centre[2]) * scale
+            directions[row, 0] = (q[0] + offset * m[0] - sx) * scale
+            directions[row, 1] = (q[1] + offset * m[1] - sy) * scale
+            directions[row, 2] = (q[2] + offset * m[2] - sz) * scale
+            row += 1
+    starts[pairs.shape[0]] = row
+    return row
+
+
+@njit(nogil=True, cache=True)
+def apply_rays(pairs, counts, a, b, whole, starts, weights, blocked, area, exchange, vary_a, vary_b, doubt):
+    """Scale the unoccluded exchange areas ``whole`` of pairs by what their rays saw."""
+    for i in range(pairs.shape[0]):
+        k = pairs[i]
+        x, y = a[k], b[k]
+        total = seen = square = 0.0
+        for r in range(starts[i], starts[i + 1]):
+            w = weights[r]
+            total += w
+            square += w * w
+            if blocked[r] != 0:
+                seen += w
+        value = whole[i]
+        if x == y:
+            # Only rays know how much of a cluster its own facets see.
+            value = min(area[x] * area[x] * total / (math.pi * counts[i]), area[x])
+        if total <= 0.0:
+            # No points of the two faced each other: a grazing glance at most, half of it, in doubt whole.
+            exchange[k] = 0.5 * value if x != y else 0.0
+            doubt[k] = exchange[k]
+            continue
+        share = seen / total
+        effective = total * total / square
+        # Two pseudo-rays, one of each kind, so that agreeing rays still leave a doubt.
+        safe = (share * effective + 1.0) / (effective + 2.0)
+        exchange[k] = value * share
+        doubt[k] = value * math.sqrt(safe * (1.0 - safe) / (effective + 2.0))
+        partly = math.sqrt(share * (1.0 - share))
+        vary_a[k] = max(vary_a[k] * max(share, 1.0 / effective), 0.5 * value / area[x] * partly)
+        vary_b[k] = max(vary_b[k] * max(share, 1.0 / effective), 0.5 * value / area[y] * partly)
+
+
+@njit(nogil=True, cache=True)
+def judge(
+    a, b, vary_a, vary_b, state, area, flat, size, bright, uneven, detail, bias, weight, can_split, error, verdict,
+    need,
+):  # fmt: skip
+    """What to do with each pair: 0 keep, 1 split the first end, 2 the second.
+
+    An end that receives has two errors: the form factor varies over it (``detail``: splitting it resolves
+    that), and radiosity and form factor both vary over the end that sends (``bias``: splitting the
+    sender does).  Errors of the links to one receiver add up, so with the sums T of all of them the
+    mean square error over all surfaces is the sum over links of ``error * T * A / total``, and the
+    root of each link's term is what is held below ``error``.
+    ``weight`` holds ``sqrt(A / total)`` and what the receiver's own detail matters; ``bright`` and
+    ``uneven`` the mean and the deviation of each node's radiosity in units of the mean irradiance.
+    """
+    for i in range(a.shape[0]):
+        verdict[i] = 0
+        need[i] = 0.0
+        if state[i] <= 0:
+            continue
+        x, y = a[i], b[i]
+        own_a, own_b = bright[y] * vary_a[i], bright[x] * vary_b[i]
+        far_a, far_b = uneven[y] * vary_b[i] * area[y] / area[x], uneven[x] * vary_a[i] * area[x] / area[y]
+        need_a = max(
+            math.sqrt(own_a * max(own_a, detail[x])) * weight[x], math.sqrt(far_b * max(far_b, bias[y])) * weight[y]
+        )  # fmt: skip
+        need_b = max(
+            math.sqrt(own_b * max(own_b, detail[y])) * weight[y], math.sqrt(far_a * max(far_a, bias[x])) * weight[x]
+        )  # fmt: skip
+        need[i] = max(need_a, need_b)
+        if need[i] <= error:
+            continue
+        if state[i] == NEAR:
+            # Only parts of the cluster, the larger of two, can tell more.
+            verdict[i] = 1 if flat[y] == 1 or (flat[x] == 0 and size[x] >= size[y]) else 2
+            continue
+        if need_a >= need_b:
+            if can_split[x]:
+                verdict[i] = 1
+            elif need_b > error and can_split[y]:
+                verdict[i] = 2
+        elif can_split[y]:
+            verdict[i] = 2
+        elif need_a > error and can_split[x]:
+            verdict[i] = 1
+
+
+@njit(nogil=True, cache=True)
+def tolerances(pairs, a, b, exchange, area, bright, weight, relative, floor, allowed):
+    """Error of the exchange area that each pair may keep."""
+    for i in range(pairs.shape[0]):
+        k = pairs[i]
+        x, y = a[k], b[k]
+        one, two = bright[y] * weight[x], bright[x] * weight[y]
+        small = math.inf
+        if one > 0.0:
+            small = floor * area[x] / one
+        if two > 0.0:
+            small = min(small, floor * area[y] / two)
+        allowed[i] = max(relative * exchange[k], small)
+
+
+@njit(nogil=True, cache=True)
+def finish(
+    first, last, pairs, allowed, a, b, state, offset, count, pool, bright, tree, geo, limit, levels, exchange, doubt,
+    work, tally,
+):  # fmt: skip
+    """Bring the exchange areas of kept pairs to their allowed errors: closed forms, and cells cut exactly."""
+    given = np.empty(MAX_CANDIDATES, dtype=np.int64)
+    for i in range(first, last):
+        k = pairs[i]
+        if doubt[k] <= allowed[i] or (state[k] != CLEAR and state[k] != CUT):
+            continue
+        x, y = a[k], b[k]
+        value = 0.0
+        tally[CLOSED] += 1
+        for p in range(tree.piece0[x], tree.piece1[x]):
+            for q in range(tree.piece0[y], tree.piece1[y]):
+                value += pair_exchange(
+                    tree.corners, tree.starts[p], tree.starts[p + 1], tree.piece_normal[p], tree.corners,
+                    tree.starts[q], tree.starts[q + 1], tree.piece_normal[q],
+                    0.3 * allowed[i] + 1e-15 * tree.area[x], work.pair,
+                )  # fmt: skip
+        if state[k] == CLEAR:
+            exchange[k] = value
+            doubt[k] = 0.1 * allowed[i]
+            continue
+        many = count[k]
+        for c in range(many):
+            given[c] = pool[offset[k] + c]
+        if not _receives_at_a(x, y, tree.area, bright):
+            x, y = y, x
+        found, whole, local, error = _element_integral(
+            tree.corners, tree.starts, tree.piece0[x], tree.piece1[x], tree.normal[x, 0], tree.normal[x, 1],
+            tree.normal[x, 2], tree.polygon[x], tree.polygon[y], tree.piece0[y], tree.piece1[y], tree.corners,
+            tree.starts, tree.piece_normal, geo.corners, geo.piece_start, geo.piece_polygon, geo.through, geo.slack,
+            given, many, limit, allowed[i], levels, work.cells, work.state, work.points, work.planes, work.picked,
+            work.boxes, work.sizes, work.weights, work.cut, tally,
+        )  # fmt: skip
+        if found < 0.0 or whole <= 0.0 or value <= 0.0 or abs(value - whole) > 0.25 * value:
+            # Too many pieces, or most of what is seen lies where no point does: rays find it.
+            exchange[k] = value
+            state[k] = RAYS
+            continue
+        # The open factor is known better than by these points; what they miss of it is as visible as
+        # the cells where they miss most.
+        missed = value - whole
+        exchange[k] = min(max(found + missed * local, 0.0), value)
+        doubt[k] = error + 0.25 * abs(missed) * (1.0 - abs(2.0 * local - 1.0))

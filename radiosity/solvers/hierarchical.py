@@ -1,0 +1,897 @@
+"""Hierarchical radiosity: links at the coarsest level that the wanted error allows.
+
+P. Hanrahan, D. Salzman and L. Aupperle, "A rapid hierarchical radiosity algorithm" (SIGGRAPH 1991),
+with clusters above the surfaces (B. Smits, J. Arvo and D. Greenberg, SIGGRAPH 1994).  What departs
+from them:
+
+* pairs are refined in whole frontiers of flat arrays, over threads, never link by link;
+* links are made as power arrives: a pair of nodes that are both dark stays where it is, at whatever
+  level, until one of them has something to send;
+* the occlusion state and the candidates of a shaft go down with the pairs: a part of a clear pair is
+  clear, and a part of any other chooses its candidates among the whole's;
+* a link keeps the exchange area of both directions, so reciprocity is exact; in a scene declared
+  closed the rows are balanced to sum to 1 without breaking it;
+* what a link may be off is weighed by its receiver's share of all area, so that the sum of squares
+  over all links estimates the mean square error: shadow edges end by themselves;
+* the equations are solved by conjugate gradients over push and pull, which near reflectance 1 needs
+  tens of sweeps, not thousands.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radiosity.form_factors._links import occluder_arrays, workspace
+from radiosity.hierarchy import Hierarchy
+from radiosity.solvers._pairs import (
+    CLEAR,
+    CUT,
+    DROPPED,
+    KEPT,
+    PART_OF_CLEAR,
+    PART_OF_CUT,
+    RAYS,
+    UNSEEN,
+    apply_rays,
+    finish,
+    judge,
+    measure,
+    pair_rays,
+    tolerances,
+)
+from radiosity.solvers._push_pull import deviations, expand, gather, pull, push, sort_links
+from radiosity.solvers.incident import incident_irradiance, light_spread
+from radiosity.solvers.progressive import remaining_bound
+from radiosity.solvers.solution import EnergyBook, Progress, ProgressEvent, Solution
+from workbench.accel.box_tree import BoxTree
+from workbench.accel.embree import EmbreeAccelerator
+from workbench.counters import Counters
+from workbench.culling.tally import add_tally, new_tally
+from workbench.errors import OptionError
+from workbench.geometry.flat import Geometry
+from workbench.memory import require_memory
+from workbench.record import RunRecord
+from workbench.scene.model import Scene
+
+__all__ = ["solve_hierarchical"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+BLOCK = 2048
+"""Pairs a task: fixed, so that nothing depends on the number of workers."""
+ROWS = 16384
+"""Receiving nodes a task of a sweep."""
+FIRST_RAYS, MOST_RAYS = 16, 256
+"""Rays a pair that only rays can settle, at first and at most."""
+CUT_LIMIT = 12
+"""Most candidates in the pyramid of one point that are cut exactly."""
+CUT_LEVELS = 3
+"""Halvings of a kept receiver in search of shadow boundaries, for its mean."""
+FINISHED = 0.25
+"""Share of the link error that the exchange area itself may be off."""
+GATHERED = 0.25
+"""What an element's own detail counts where direct light is gathered: the nearby points that see it at all."""
+COARSER = (16.0, 16.0, 4.0, 1.0)
+"""Link errors of the rounds in units of the last: emitters first, then with what they lit, then finer."""
+COVERED = 0.01
+"""Share of an element of a closed scene that must see nothing to count as covered (the floor under a box)."""
+UNEVEN = 2.0
+"""What an uneven sender counts against a receiver's own detail: it shifts means, which reflection hands on."""
+PAIR_BYTES = 120
+"""Memory that a new pair takes while it is measured, and as a link with both its directions."""
+SMALLEST = 2.0**-14
+"""Shortest edge that is split by default, as a share of the scene's size."""
+
+
+@dataclass
+class _Links:
+    """Pairs of nodes as flat arrays; see :mod:`radiosity.solvers._pairs`."""
+
+    a: NDArray[np.int32]
+    b: NDArray[np.int32]
+    state: NDArray[np.int8]
+    offset: IntArray
+    count: NDArray[np.int32]
+    exchange: FloatArray
+    vary_a: NDArray[np.float32]
+    vary_b: NDArray[np.float32]
+    doubt: NDArray[np.float32]
+
+    @classmethod
+    def unseen(cls, a: NDArray, b: NDArray) -> _Links:
+        n = len(a)
+        return cls(
+            a.astype(np.int32),
+            b.astype(np.int32),
+            np.full(n, UNSEEN, dtype=np.int8),
+            np.zeros(n, dtype=np.int64),
+            np.full(n, -1, dtype=np.int32),
+            np.zeros(n),
+            *(np.zeros(n, dtype=np.float32) for _ in range(3)),
+        )
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+    def take(self, which: NDArray) -> _Links:
+        return _Links(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    @staticmethod
+    def join(parts: list[_Links]) -> _Links:
+        if len(parts) == 1:
+            return parts[0]
+        return _Links(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(_Links)))
+
+
+class _Exchange:
+    """The operator from radiosity of the leaves to their irradiance, over all links."""
+
+    def __init__(self, tree: Hierarchy, links: _Links, pool: ThreadPoolExecutor, *, ignore_unseen: bool = True) -> None:
+        self.tree, self.pool = tree, pool
+        self.leaves = tree.leaves()
+        self.area = tree.arrays.area[self.leaves]
+        self.scale = np.ones(len(self.leaves))
+        n, m = tree.node_count, len(links)
+        self.start = np.zeros(n + 1, dtype=np.int64)
+        self.column = np.zeros(2 * m, dtype=np.int32)
+        self.factor = np.zeros(2 * m)
+        # What waits for light carries none.
+        exchange = np.where(links.state > 0, links.exchange, 0.0) if ignore_unseen else links.exchange
+        sort_links(links.a, links.b, exchange, tree.arrays.area, self.start, self.column, self.factor)
+
+    def up(self, values: FloatArray) -> FloatArray:
+        """Means of leaf values (n, bands) for all nodes."""
+        arrays = self.tree.arrays
+        nodes = np.zeros((self.tree.node_count, values.shape[1]))
+        nodes[self.leaves] = values
+        pull(nodes, self.tree.node_count, arrays.opened, arrays.child, arrays.children, arrays.area)
+        return nodes
+
+    def down(self, nodes: FloatArray) -> FloatArray:
+        """Leaf sums (n, bands) of what all nodes received; ``nodes`` is used up."""
+        arrays = self.tree.arrays
+        push(nodes, self.tree.node_count, arrays.opened, arrays.child, arrays.children)
+        return nodes[self.leaves]
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        scale = self.scale[:, None]
+        nodes = self.up(values * scale)
+        received = np.empty_like(nodes)
+        blocks = range(0, len(nodes), ROWS)
+        list(
+            self.pool.map(
+                lambda i: gather(
+                    i, min(i + ROWS, len(nodes)), self.start, self.column, self.factor, nodes, received
+                ),
+                blocks,
+            )
+        )  # fmt: skip
+        return self.down(received) * scale
+
+    def balance(self, wanted: FloatArray, rounds: int = 100) -> None:
+        """Scale rows and columns alike until the rows sum to ``wanted`` (n,); rows of nothing stay.
+
+        The symmetric scaling of :func:`radiosity.solvers.direct.balance_rows`, on links.
+        """
+        for _ in range(rounds):
+            sums = self(np.ones((len(self.area), 1)))[:, 0]
+            ratio = np.divide(wanted, sums, out=np.ones_like(sums), where=(sums > 0) & (wanted > 0))
+            if np.abs(ratio - 1.0).max(initial=0.0) < 1e-13:
+                break
+            self.scale *= np.sqrt(ratio)
+
+
+class _Solver:
+    """One hierarchical solve: the tree, its links, and the brightness that refines them."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        geometry: Geometry,
+        record: RunRecord,
+        *,
+        min_edge: float,
+        direct_in_mesh: bool,
+        relative: float,
+        workers: int,
+        seed: int,
+        max_elements: int | None,
+    ) -> None:
+        self.scene, self.geometry, self.record = scene, geometry, record
+        self.min_edge, self.direct_in_mesh, self.relative, self.seed = min_edge, direct_in_mesh, relative, seed
+        self.max_elements = max_elements
+        self.counters = Counters()
+        self.pool = ThreadPoolExecutor(workers)
+        self.workers = workers
+        self.seconds_in_embree = 0.0
+        with record.stage("tree"):
+            self.tree = Hierarchy(scene, geometry)
+            self.geo = occluder_arrays(geometry, BoxTree.build(geometry))
+            self.accelerator = EmbreeAccelerator(geometry, workers=workers)
+        materials = [surface.material for surface in scene.surfaces]
+        self.rho = np.stack([m.reflectance for m in materials])
+        self.emission = np.stack([m.emission for m in materials])
+        first = geometry.piece_start[:-1]
+        self.piece_area = _piece_areas(geometry) if len(first) else np.zeros(0)
+        longest = int(np.diff(geometry.piece_start).max(initial=4))
+        self._idle = [workspace(max(longest, 4)) for _ in range(workers)]
+        self.links = _Links.unseen(np.zeros(1, np.int32), np.zeros(1, np.int32))
+        self.candidates = np.zeros(0, dtype=np.int32)
+        self.total_area = float(self.tree.arrays.area[0])
+        n = self.tree.node_count
+        self.bright = np.zeros(n)
+        self.uneven = np.zeros(n)
+        self.detail = np.zeros(n)
+        self.bias = np.zeros(n)
+        self._weigh()
+
+    def close(self) -> None:
+        self.pool.shutdown()
+
+    # ---- what nodes are worth ------------------------------------------------------------------
+
+    def _weigh(self) -> None:
+        """Weights of all nodes as receivers, and whether each can be split."""
+        arrays, n = self.tree.arrays, self.tree.node_count
+        share = np.sqrt(arrays.area[:n] / self.total_area)
+        self.plain = share
+        self.weight = share
+        if not self.direct_in_mesh:
+            surface = arrays.surface[:n]
+            reflected = np.where(surface >= 0, self.rho.max(axis=1)[np.maximum(surface, 0)], self.rho.max())
+            self.weight = share * (GATHERED * reflected)
+        self.can_split = (arrays.opened[:n] == 1) | (arrays.children[:n] > 0) | (arrays.size[:n] > 2.0 * self.min_edge)
+
+    def _grown(self) -> None:
+        """Let new nodes have what their parents have."""
+        n, old = self.tree.node_count, len(self.bright)
+        if n > old:
+            parent = self.tree.arrays.parent[old:n]
+            # Parents come first: a cell's parent may itself be new, but never within one call of ``open``.
+            self.bright = np.concatenate([self.bright, self.bright[parent]])
+            self.uneven = np.concatenate([self.uneven, np.zeros(n - old)])
+            self.detail = np.concatenate([self.detail, self.detail[parent]])
+            self.bias = np.concatenate([self.bias, self.bias[parent]])
+        self._weigh()
+
+    # ---- frontiers -----------------------------------------------------------------------------
+
+    def _tasks(self, work: Callable[[int, int, Any, NDArray], None], count: int) -> None:
+        """Run ``work(first, last, workspace, tally)`` over blocks of pairs."""
+
+        def one(first: int) -> NDArray:
+            tally = new_tally()
+            scratch = self._idle.pop()
+            try:
+                work(first, min(first + BLOCK, count), scratch, tally)
+            finally:
+                self._idle.append(scratch)
+            return tally
+
+        for tally in self.pool.map(one, range(0, count, BLOCK)):
+            add_tally(self.counters, tally)
+
+    def _measure(self, pairs: _Links) -> FloatArray:
+        """Measure unseen pairs, rays included; returns the unoccluded exchange areas."""
+        narrowed: dict[int, NDArray[np.int32]] = {}
+        counts = np.empty(len(pairs), dtype=np.int32)
+
+        def work(first: int, last: int, scratch: Any, tally: NDArray) -> None:
+            fresh = np.empty((last - first) * KEPT, dtype=np.int32)
+            used = measure(
+                first, last, pairs.a, pairs.b, pairs.state, pairs.offset, pairs.count, self.candidates, self.bright,
+                self.tree.arrays, self.geo, self.piece_area, CUT_LIMIT, pairs.exchange, pairs.vary_a, pairs.vary_b,
+                pairs.doubt, counts, fresh, scratch, tally,
+            )  # fmt: skip
+            narrowed[first] = fresh[:used].copy()
+
+        self._tasks(work, len(pairs))
+        pool = [narrowed[first] for first in sorted(narrowed)]
+        lengths = np.maximum(counts, 0).astype(np.int64)
+        pairs.offset[:] = len(self.candidates) + np.cumsum(lengths) - lengths
+        pairs.count[:] = counts
+        self.candidates = np.concatenate([self.candidates, *pool])
+        whole = pairs.exchange.copy()
+        rays = np.flatnonzero(pairs.state >= RAYS)
+        self._trace(pairs, rays, np.full(len(rays), FIRST_RAYS), whole)
+        return whole
+
+    def _trace(self, pairs: _Links, chosen: IntArray, counts: IntArray, whole: FloatArray) -> None:
+        """Let rays find what the chosen pairs see of each other."""
+        centre, scale = self.accelerator.frame
+
+        def work(first: int, last: int, scratch: Any, tally: NDArray) -> None:
+            block, many = chosen[first:last], counts[first:last]
+            most = int(many.sum())
+            starts = np.empty(len(block) + 1, dtype=np.int64)
+            origins = np.empty((most, 3), dtype=np.float32)
+            directions = np.empty_like(origins)
+            weights = np.empty(most)
+            used = pair_rays(
+                block, many, pairs.a, pairs.b, self.seed, self.tree.arrays, self.accelerator.offset, centre, scale,
+                starts, origins, directions, weights,
+            )  # fmt: skip
+            clock = time.perf_counter()
+            blocked = self.accelerator.blocked_raw(origins[:used], directions[:used], np.ones(used, dtype=np.float32))
+            self.seconds_in_embree += time.perf_counter() - clock
+            apply_rays(
+                block, many, pairs.a, pairs.b, whole[block], starts, weights, blocked, self.tree.arrays.area,
+                pairs.exchange, pairs.vary_a, pairs.vary_b, pairs.doubt,
+            )  # fmt: skip
+            traced.append(used)
+
+        traced: list[int] = []
+        self._tasks(work, len(chosen))
+        self.counters.add(rays=sum(traced))
+
+    def _judge(self, pairs: _Links, error: float) -> tuple[NDArray[np.int8], FloatArray]:
+        verdict, need = np.empty(len(pairs), dtype=np.int8), np.empty(len(pairs))
+        judge(
+            pairs.a, pairs.b, pairs.vary_a, pairs.vary_b, pairs.state, self.tree.arrays.area, self.tree.arrays.flat,
+            self.tree.arrays.size, self.bright, self.uneven, self.detail, self.bias, self.weight, self.can_split,
+            error, verdict, need,
+        )  # fmt: skip
+        return verdict, need
+
+    def _finish(self, pairs: _Links, kept: IntArray, whole: FloatArray | None, error: float) -> None:
+        """Bring kept pairs to the accuracy that the link error asks for."""
+        allowed = np.empty(len(kept))
+        tolerances(
+            kept, pairs.a, pairs.b, pairs.exchange, self.tree.arrays.area, self.bright, self.plain, self.relative,
+            FINISHED * error, allowed,
+        )  # fmt: skip
+
+        def work(first: int, last: int, scratch: Any, tally: NDArray) -> None:
+            finish(
+                first, last, kept, allowed, pairs.a, pairs.b, pairs.state, pairs.offset, pairs.count, self.candidates,
+                self.bright, self.tree.arrays, self.geo, CUT_LIMIT, CUT_LEVELS, pairs.exchange, pairs.doubt, scratch,
+                tally,
+            )  # fmt: skip
+
+        was = pairs.state[kept] >= RAYS
+        self._tasks(work, len(kept))
+        rays = pairs.state[kept] >= RAYS
+        fresh = kept[rays & ~was]
+        if whole is None:
+            whole = pairs.exchange.copy()
+            more = fresh
+            counts = np.full(len(fresh), FIRST_RAYS)
+        else:
+            whole[fresh] = pairs.exchange[fresh]
+            again = rays & was & (pairs.doubt[kept] > allowed)
+            ratio = pairs.doubt[kept][again] / np.maximum(allowed[again], 1e-300)
+            more = np.concatenate([fresh, kept[again]])
+            # Noise falls with the root of the rays.
+            wanted = np.concatenate([np.full(len(fresh), 4.0 * FIRST_RAYS), FIRST_RAYS * ratio**2])
+            counts = np.clip(wanted, FIRST_RAYS, MOST_RAYS).astype(np.int64)
+        self._trace(pairs, more, counts, whole)
+
+    def _split(self, pairs: _Links, verdict: NDArray[np.int8], need: FloatArray) -> tuple[_Links, NDArray[np.bool_]]:
+        """Parts of the pairs with a verdict, and the pairs that no room was left to split."""
+        arrays = self.tree.arrays
+        chosen = np.flatnonzero(verdict)
+        ends = np.where(verdict == 1, pairs.a, pairs.b)[chosen]
+        refused = np.zeros(len(pairs), dtype=bool)
+        closed = arrays.opened[ends] == 0
+        nodes, place = np.unique(ends[closed], return_inverse=True)
+        if self.max_elements is not None and len(nodes):
+            # Where elements are counted, those with the largest need come first.
+            largest = np.zeros(len(nodes))
+            np.maximum.at(largest, place, need[chosen[closed]])
+            parts = np.where(arrays.children[nodes] > 0, arrays.children[nodes], 4)
+            order = np.argsort(-largest, kind="stable")
+            room = self.max_elements - self.tree.leaf_count
+            allowed = np.zeros(len(nodes), dtype=bool)
+            allowed[order] = np.cumsum(parts[order] - 1) <= room
+            refused[chosen[closed]] = ~allowed[place]
+            nodes = nodes[allowed]
+        self.tree.open(nodes.astype(np.int64))
+        self._grown()
+        arrays = self.tree.arrays
+        chosen = np.flatnonzero((verdict > 0) & ~refused)
+        ends = np.where(verdict == 1, pairs.a, pairs.b)[chosen]
+        parts = arrays.children[ends]
+        itself = pairs.a[chosen] == pairs.b[chosen]
+        most = int(np.where(itself, parts * (parts + 1) // 2, parts).sum())
+        require_memory(
+            float(most * PAIR_BYTES), f"{most:.3g} more links", "ask for a larger link error or fewer elements"
+        )
+        a, b, parent = (np.empty(most, dtype=np.int32) for _ in range(3))
+        used = expand(chosen, verdict, pairs.a, pairs.b, arrays.children, arrays.child, a, b, parent)
+        made = _Links.unseen(a[:used], b[:used])
+        came = parent[:used]
+        # A flat node does not see itself.
+        real = (made.a != made.b) | (arrays.flat[made.a] == 0)
+        if not real.all():
+            made, came = made.take(real), came[real]
+        # Of a clear pair all parts are clear; of any other they choose among its candidates.
+        known = pairs.state[came]
+        made.state[known == CLEAR], made.state[known == CUT] = PART_OF_CLEAR, PART_OF_CUT
+        made.vary_a[:], made.vary_b[:] = pairs.vary_a[came], pairs.vary_b[came]
+        made.offset[:], made.count[:] = pairs.offset[came], pairs.count[came]
+        # Until it is measured a part has its share of the whole.
+        split = np.where(verdict[came] == 1, pairs.a[came], pairs.b[came])
+        part = np.where(arrays.parent[made.a] == split, made.a, made.b)
+        made.exchange[:] = pairs.exchange[came] * arrays.area[part] / arrays.area[split]
+        return made, refused
+
+    def refine(self, error: float, report: Callable[[int], None]) -> None:
+        """Split and measure until no link is off by more than ``error``, or nothing may be split."""
+        done: list[_Links] = []
+        store = self.links
+        lit = (self.bright[store.a] > 0) | (self.bright[store.b] > 0)
+        waiting = (store.state <= 0) & lit
+        frontier = store.take(waiting)
+        store = store.take(~waiting)
+        verdict, need = self._judge(store, error)
+        pending: list[_Links] = []
+        try:
+            kept = np.flatnonzero((verdict == 0) & (store.state > 0))
+            self._finish(store, kept, None, error)
+            while True:
+                report(len(store) + sum(len(part) for part in done) + len(frontier))
+                if len(frontier):
+                    pending = [frontier]
+                    whole = self._measure(frontier)
+                    alive = frontier.state != DROPPED
+                    frontier, whole = frontier.take(alive), whole[alive]
+                    verdict_new, need_new = self._judge(frontier, error)
+                    kept = np.flatnonzero(verdict_new == 0)
+                    self._finish(frontier, kept, whole, error)
+                    done.append(frontier.take(kept))
+                    split = np.flatnonzero(verdict_new)
+                    pairs, verdict_now, need_now = frontier.take(split), verdict_new[split], need_new[split]
+                    pending = [pairs]
+                else:
+                    pairs, verdict_now, need_now = store.take(verdict > 0), verdict[verdict > 0], need[verdict > 0]
+                    pending = [pairs]
+                    store = store.take(verdict == 0)
+                    verdict = np.zeros(len(store), dtype=np.int8)
+                if not len(pairs):
+                    if not (verdict > 0).any():
+                        pending = []
+                        break
+                    frontier = pairs
+                    continue
+                parts, refused = self._split(pairs, verdict_now, need_now)
+                if refused.any():
+                    left = pairs.take(refused)
+                    self._finish(left, np.arange(len(left)), None, error)
+                    done.append(left)
+                dark = (self.bright[parts.a] == 0) & (self.bright[parts.b] == 0)
+                done.append(parts.take(dark))
+                frontier = parts.take(~dark)
+                pending = [frontier]
+        finally:
+            # Also when interrupted: what is waiting keeps its share of the pair that was split.
+            self.links = _Links.join([store, *done, *pending])
+            self._compact()
+
+    def _compact(self) -> None:
+        """Keep only the candidate lists that links still have."""
+        links = self.links
+        lengths = np.maximum(links.count, 0).astype(np.int64)
+        total = int(lengths.sum())
+        if total == len(self.candidates):
+            return
+        first = np.cumsum(lengths) - lengths
+        index = np.repeat(links.offset - first, lengths) + np.arange(total)
+        self.candidates = self.candidates[index]
+        links.offset = first
+
+    # ---- solving -------------------------------------------------------------------------------
+
+    def divide(self, max_edge: float) -> None:
+        """Open leaves until no flat one has an edge longer than ``max_edge``."""
+        while True:
+            leaves = self.tree.leaves()
+            longest = self.tree.longest_edges(leaves)
+            chosen = leaves[(longest > max_edge) & self.can_split[leaves]]
+            if not len(chosen):
+                return
+            require_memory(
+                float(len(leaves) * 2000), f"{4 * len(chosen):.3g} more elements", "ask for a larger max_edge"
+            )
+            self.tree.open(chosen)
+            self._grown()
+
+    def refine_for_lights(self, error: float, unit: FloatArray) -> None:
+        """Split leaves over which the light of lights without surface varies by more than ``error``."""
+        if not self.scene.lights:
+            return
+        fresh = self.tree.leaves()
+        while len(fresh):
+            spread = light_spread(self.scene, self.tree.mesh(fresh), self.accelerator, seed=self.seed)
+            need = (spread / unit).max(axis=1) * self.weight[fresh]
+            chosen = np.flatnonzero((need > error) & self.can_split[fresh])
+            if self.max_elements is not None:
+                chosen = chosen[np.argsort(-need[chosen], kind="stable")]
+                room = (self.max_elements - self.tree.leaf_count) // 3
+                chosen = np.sort(chosen[: max(room, 0)])
+            if not len(chosen):
+                return
+            self.tree.open(fresh[chosen])
+            self._grown()
+            arrays = self.tree.arrays
+            nodes = fresh[chosen]
+            fresh = np.repeat(arrays.child[nodes], arrays.children[nodes])
+            counts = arrays.children[nodes]
+            fresh = fresh + np.arange(len(fresh)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+    def illuminate(self, radiosity: FloatArray, exchange: _Exchange, unit: FloatArray) -> None:
+        """Take the brightness of all nodes from the radiosity of the leaves."""
+        relative = radiosity / unit
+        mean = exchange.up(relative)
+        square = exchange.up(relative**2)
+        self.bright = mean.max(axis=1)
+        self.uneven = np.empty(len(mean))
+        deviations(square, mean, self.uneven)
+        self.uneven *= UNEVEN
+        self._weigh()
+
+    def accumulate(self, exchange: _Exchange) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Errors of all links to each leaf, in units of the mean irradiance (leaves,).
+
+        Detail and bias (see :func:`radiosity.solvers._pairs.judge`) add up; the doubts of form factors, of
+        either sign, add in squares.  Keeps the first two as means for every node.
+        """
+        links, n = self.links, self.tree.node_count
+        area, bright, uneven = self.tree.arrays.area, self.bright, self.uneven
+        a, b = links.a, links.b
+        two = np.where(a == b, 0.0, 1.0)  # a link of a node with itself receives once
+
+        def at_leaves(one: FloatArray, other: FloatArray) -> FloatArray:
+            nodes = np.bincount(a, one, n) + np.bincount(b, other * two, n)
+            return exchange.down(nodes[:, None])[:, 0]
+
+        detail = at_leaves(bright[b] * links.vary_a, bright[a] * links.vary_b)
+        bias = at_leaves(
+            uneven[b] * links.vary_b * area[b] / area[a], uneven[a] * links.vary_a * area[a] / area[b]
+        )  # fmt: skip
+        doubt = at_leaves((bright[b] * links.doubt / area[a]) ** 2, (bright[a] * links.doubt / area[b]) ** 2)
+        self.detail, self.bias = exchange.up(np.column_stack([detail, bias])).T.copy()
+        return detail, bias, np.sqrt(doubt)
+
+
+def _piece_areas(geometry: Geometry) -> FloatArray:
+    triangles, piece = geometry.triangles
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return np.bincount(piece, 0.5 * np.linalg.norm(cross, axis=1), geometry.piece_count).astype(np.float64)
+
+
+def _conjugate_gradients(
+    apply: Callable[[FloatArray], FloatArray], right: FloatArray, start: FloatArray, area: FloatArray, limit: float
+) -> FloatArray:
+    """Solve ``apply(z) = right`` (n, bands), each band for itself, in the inner product of ``area``.
+
+    ``apply`` is symmetric and positive in it.  Ends when every band's residual is below ``limit`` of its
+    right side, or no longer falls.
+    """
+    z = start.copy()
+    residual = right - apply(z)
+    along = residual.copy()
+    square = area @ residual**2
+    goal = limit**2 * (area @ right**2)
+    for _ in range(500):
+        busy = square > goal
+        if not busy.any():
+            break
+        image = apply(along)
+        curve = area @ (along * image)
+        step = np.divide(square, curve, out=np.zeros_like(square), where=busy & (curve > 0))
+        z += step * along
+        residual -= step * image
+        fresh = area @ residual**2
+        along = residual + np.divide(fresh, square, out=np.zeros_like(square), where=square > 0) * along
+        square = fresh
+    return z
+
+
+def _row_targets(exchange: _Exchange, links: _Links, closed: bool, largest_rho: float, record: RunRecord) -> FloatArray:
+    """Row sums wanted of the leaves; puts those found, and the doubt of them, into the record."""
+    sums = exchange(np.ones((len(exchange.area), 1)))[:, 0]
+    n = exchange.tree.node_count
+    area = exchange.tree.arrays.area[:n]
+    doubt = np.bincount(links.a, links.doubt, n) + np.where(
+        True, np.bincount(links.b, np.where(links.a == links.b, 0.0, links.doubt), n), 0.0
+    )
+    stated = exchange.down((doubt / area)[:, None])[:, 0]
+    record.errors["row_sum"] = {
+        "min": float(sums.min()),
+        "mean": float(np.average(sums, weights=exchange.area)),
+        "max": float(sums.max()),
+        "stated_error": float(stated.max()),
+        "rows": len(sums),
+    }
+    if not closed:
+        # Rows above 1 are errors as those below are; cutting only the former would lose light.
+        return np.minimum(sums, 1.0) if sums.max() * largest_rho >= 1.0 else sums
+    covered = 1.0 - sums > np.maximum(stated, COVERED)
+    record.results["covered_elements"] = int(covered.sum())
+    return np.where(covered, sums, 1.0)
+
+
+def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, closed: bool, limit: float) -> None:
+    """Solve for the leaves over the links there are; fills the solution and its energy book."""
+    mesh, book = solution.mesh, solution.book
+    area = exchange.area
+    wanted = _row_targets(exchange, solver.links, closed, float(solver.rho.max()), solver.record)
+    exchange.balance(wanted)
+    visible = np.where(wanted > 0, wanted, 1.0)[:, None] if closed else np.ones((len(area), 1))
+    incident = solution.direct_irradiance
+    sent = mesh.emission + mesh.reflectance * incident / visible
+    back = mesh.reflectance / visible
+    root = np.sqrt(back)
+    # E = K (s + R E) with K symmetric: z = sqrt(R) E solves (1 - sqrt(R) K sqrt(R)) z = sqrt(R) K s.
+    right = root * exchange(sent)
+    start = root * (solution.irradiance - incident)
+    z = _conjugate_gradients(lambda v: v - root * exchange(root * v), right, start, area, limit)
+    seen = sent + root * z
+    arriving = exchange(seen)
+    solution.irradiance = incident + arriving
+    solution.radiosity = mesh.emission + mesh.reflectance * solution.irradiance
+    # What leaves, as a mean over the element, against what was sent of it: the residual is yet unshot.
+    shot = seen * visible + mesh.emission * (1.0 - visible)
+    solution.unshot = solution.radiosity - shot
+    book.emitted = area @ (mesh.emission + incident)
+    book.shot = area @ shot
+    book.received = area @ (incident + arriving)
+    book.absorbed = area @ ((1.0 - mesh.reflectance) * (incident + arriving))
+    book.escaped = book.shot - area @ arriving
+
+
+def _forecast_unit(scene: Scene, mesh_area: FloatArray, emission: FloatArray, rho: FloatArray) -> FloatArray:
+    """First guess of the mean irradiance a band, from the power there is. [W m-2]"""
+    total = mesh_area.sum()
+    mean_rho = np.minimum(mesh_area @ rho / total, 0.99)
+    unit = mesh_area @ emission / total
+    unit = unit / (1.0 - mean_rho) if scene.closed else unit
+    return np.where(unit > 0, unit, max(float(unit.max(initial=0.0)), 1e-300))
+
+
+def solve_hierarchical(
+    scene: Scene,
+    geometry: Geometry,
+    record: RunRecord,
+    *,
+    link_error: float | None = 1e-3,
+    max_edge: float | None = None,
+    min_edge: float | None = None,
+    direct_in_mesh: bool = True,
+    max_elements: int | None = None,
+    form_factor_error: float | None = None,
+    tolerance: float = 1e-6,
+    workers: int = 1,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Solution:
+    """Solve a scene over a hierarchy of links.
+
+    Parameters
+    ----------
+    scene, geometry : Scene, Geometry
+        A scene and its flattened form.
+    record : RunRecord
+        Gets the stages, counters, errors and results.
+    link_error : float, optional
+        Largest error that one link may leave, as a share of the mean irradiance of the scene: the
+        deviation of the link's light over its receiver, times the root of the receiver's share of
+        all area.  Squares of all links' errors add up to about the mean square error of the
+        irradiance, reported as ``link_error_estimate``.  ``None`` with ``max_elements``: as small as that
+        number allows.
+    max_edge : float, optional
+        Split everything until no flat element is longer than this, whatever its links.  [scene lengths]
+    min_edge : float, optional
+        Elements shorter than twice this are not split.  [scene lengths]  By default 2^-14 of the
+        scene's size: where the link error ends splitting by itself.
+    direct_in_mesh : bool
+        Let elements resolve what they receive, shadows too: for meshes that are looked at as they
+        are.  Without it elements are as fine as what they *reflect* needs (points and pictures take
+        direct light themselves), and far fewer.
+    max_elements : int, optional
+        Make no more than about so many elements; those with the largest need are made.
+    form_factor_error : float, optional
+        Relative error of each kept form factor, where closed forms and cuts can reach it; by default
+        only what the link error needs.
+    tolerance : float
+        Bound on the light still missing when the linear equations count as solved.
+    workers : int
+        Threads; the answer does not depend on it.
+    seed : int
+        Of the rays.
+    progress : callable, optional
+        Called with a :class:`ProgressEvent` at every frontier; a ``KeyboardInterrupt`` from it ends the
+        refinement, and the links there are give the solution.
+
+    Returns
+    -------
+    Solution
+        Its elements are the leaves of the tree; clusters of small facets may be among them.
+
+    Raises
+    ------
+    OptionError
+        If an option is out of range.
+    MemoryForecastError
+        If the links would not fit in memory.
+    """
+    if link_error is None and max_elements is None:
+        raise OptionError("link_error and max_elements were both left out; give one of them")
+    if link_error is not None and not (math.isfinite(link_error) and link_error > 0):
+        raise OptionError(f"link_error: found {link_error}, expected a positive number such as 1e-3")
+    for name, length in (("min_edge", min_edge), ("max_edge", max_edge)):
+        if length is not None and not (math.isfinite(length) and length > 0):
+            raise OptionError(f"{name}: found {length}, expected a positive length")
+    if max_elements is not None and max_elements < 1:
+        raise OptionError(f"max_elements: found {max_elements}, expected 1 or more")
+    solver = _Solver(
+        scene,
+        geometry,
+        record,
+        min_edge=min_edge if min_edge is not None else SMALLEST * geometry.size,
+        direct_in_mesh=direct_in_mesh,
+        relative=form_factor_error or 0.0,
+        workers=workers,
+        seed=seed,
+        max_elements=max_elements,
+    )
+    try:
+        if max_edge is not None:
+            solver.divide(max_edge)
+        return _rounds(solver, link_error, tolerance, progress)
+    finally:
+        solver.close()
+
+
+def _errors_of_rounds(solver: _Solver, link_error: float | None) -> Iterable[float]:
+    """Link errors of the rounds, each finer than the last."""
+    if link_error is not None:
+        for factor in COARSER:
+            yield factor * link_error
+        return
+    assert solver.max_elements is not None
+    error = 1e-2
+    yield error
+    while True:
+        yield error
+        if solver.tree.leaf_count >= 0.98 * solver.max_elements or error < 1e-7:
+            return
+        error *= 0.5
+
+
+def _rounds(solver: _Solver, link_error: float | None, tolerance: float, progress: Progress | None) -> Solution:
+    """Refine and solve, round by round."""
+    record, tree, scene = solver.record, solver.tree, solver.scene
+    begin = time.perf_counter()
+    solution: Solution | None = None
+    leaves = tree.leaves()
+    surface = tree.arrays.surface[leaves]
+    unit = _forecast_unit(scene, tree.arrays.area[leaves], solver.emission[surface], solver.rho[surface])
+    stopped = ""
+    before: float | None = None
+    for step, error in enumerate(_errors_of_rounds(solver, link_error)):
+        final = link_error if link_error is not None else error
+        if before is not None:
+            # What the sums will be after this round, about.
+            solver.detail *= error / before
+            solver.bias *= error / before
+        before = error
+
+        def report(links: int, error: float = error, final: float = final) -> None:
+            if progress is not None:
+                seconds = time.perf_counter() - begin
+                progress(ProgressEvent(links, error, final, seconds, f"linking, {tree.leaf_count} elements"))
+
+        try:
+            if step == 0:
+                leaves = tree.leaves()
+                incident = _incident(solver, leaves)
+                lit = tree.arrays.area[leaves] @ incident / solver.total_area
+                unit = np.maximum(unit, lit)
+                with record.stage("incident light"):
+                    solver.refine_for_lights(error, unit)
+                leaves = tree.leaves()
+                incident = _incident(solver, leaves)
+                surface = tree.arrays.surface[leaves]
+                first = solver.emission[surface] + solver.rho[surface] * incident
+                empty = _Exchange(tree, solver.links.take(np.zeros(0, np.int64)), solver.pool)
+                solver.illuminate(first, empty, unit)
+            elif scene.lights:
+                with record.stage("incident light"):
+                    solver.refine_for_lights(error, unit)
+            with record.stage("links"):
+                solver.refine(error, report)
+        except KeyboardInterrupt:
+            stopped = "interrupted"
+        with record.stage("solve"):
+            whole = (
+                step > 0
+                and not (
+                    (solver.links.state <= 0)
+                    & ((solver.bright[solver.links.a] > 0) | (solver.bright[solver.links.b] > 0))
+                ).any()
+            )
+            solution, exchange = _solved(solver, closed=scene.closed and whole, limit=1e-3, ignore_unseen=not stopped)
+            area = exchange.area
+            found = area @ solution.irradiance / area.sum()
+            unit = np.where(found > 0, found, unit)
+            solver.illuminate(solution.radiosity, exchange, unit)
+            solver.accumulate(exchange)
+        if stopped:
+            break
+    assert solution is not None
+    with record.stage("solve"):
+        limit = 1e-3
+        while remaining_bound(solution) > tolerance and limit > 1e-15:
+            limit *= 1e-3
+            _solve_links(solver, exchange, solution, closed=scene.closed and whole, limit=limit)
+    solution.converged = not stopped
+    solution.stopped = stopped or "tolerance"
+    _report(solver, solution, exchange, unit)
+    return solution
+
+
+def _incident(solver: _Solver, leaves: IntArray) -> FloatArray:
+    """Irradiance of leaves from lights without surface and from the background."""
+    scene = solver.scene
+    if not scene.lights and (scene.closed or not scene.background.any()):
+        return np.zeros((len(leaves), scene.bands))
+    with solver.record.stage("incident light"):
+        return incident_irradiance(scene, solver.tree.mesh(leaves), solver.accelerator, seed=solver.seed)
+
+
+def _solved(solver: _Solver, *, closed: bool, limit: float, ignore_unseen: bool) -> tuple[Solution, _Exchange]:
+    """The solution over the links and leaves that there are."""
+    tree, links = solver.tree, solver.links
+    exchange = _Exchange(tree, links, solver.pool, ignore_unseen=ignore_unseen)
+    mesh = tree.mesh(exchange.leaves)
+    incident = _incident(solver, exchange.leaves)
+    solution = Solution(
+        scene=solver.scene,
+        mesh=mesh,
+        radiosity=mesh.emission + mesh.reflectance * incident,
+        irradiance=incident.copy(),
+        unshot=np.zeros_like(incident),
+        book=EnergyBook.empty(mesh.bands),
+        record=solver.record,
+        direct_irradiance=incident,
+    )
+    _solve_links(solver, exchange, solution, closed=closed, limit=limit)
+    return solution, exchange
+
+
+def _report(solver: _Solver, solution: Solution, exchange: _Exchange, unit: FloatArray) -> None:
+    """Put what the run knows of its own errors into the record."""
+    record, links = solver.record, solver.links
+    record.counters.merge(solver.counters)
+    record.counters.merge(solver.accelerator.counters)
+    record.seconds["inside embree, summed over threads"] = solver.seconds_in_embree
+    record.errors["remaining_bound"] = remaining_bound(solution)
+    record.errors["energy_imbalance"] = solution.book.imbalance(solution.unshot_power)
+    # Both directions of a link are one number.
+    record.errors["reciprocity"] = 0.0
+    parts = solver.accumulate(exchange)
+    record.errors["link_error_estimate"] = {
+        name: math.sqrt(float(exchange.area @ part**2) / solver.total_area)
+        for name, part in zip(("over_receivers", "over_senders", "form_factors"), parts, strict=True)
+    }
+    record.errors["facet_error"] = solution.mesh.facet_error
+    record.results.update(
+        elements=solution.mesh.element_count,
+        nodes=solver.tree.node_count,
+        links=len(links),
+        links_clear=int((links.state == CLEAR).sum()),
+        links_cut=int((links.state == CUT).sum()),
+        links_by_rays=int((links.state >= RAYS).sum()),
+        energy_book=solution.book.as_dict(),
+        stopped=solution.stopped,
+    )
