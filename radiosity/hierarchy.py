@@ -401,8 +401,8 @@ class Hierarchy:
         side_of = [np.zeros(total, dtype=np.int64)]
         for item in order:
             s, sign = sides[item]
-            own = np.arange(first_polygon[s], first_polygon[s + 1])
-            features = np.column_stack([place[own], sign * _NORMAL_WEIGHT * geometry.polygon_normal[own]])
+            members = np.arange(first_polygon[s], first_polygon[s + 1])
+            features = np.column_stack([place[members], sign * _NORMAL_WEIGHT * geometry.polygon_normal[members]])
             order_s, start_s, stop_s, child_s = self._subtree(features)
             root = leaf_of[int(item)]
             # The subtree's root is the top tree's leaf; its other nodes follow the nodes so far.
@@ -420,9 +420,9 @@ class Hierarchy:
             spans.append(bounds[1:])
             surface_of.append(np.full(len(child_s) - 1, s))
             side_of.append(np.full(len(child_s) - 1, sign))
-            runs.append((s, sign, own[order_s]))
+            runs.append((s, sign, members[order_s]))
             total += len(child_s) - 1
-            position += len(own)
+            position += len(members)
         table, span = np.concatenate(nodes), np.concatenate(spans)
         # The top tree's inner nodes span what their children do.
         for k in range(len(parent) - 1, -1, -1):
@@ -568,20 +568,17 @@ class Hierarchy:
     def _reserve(self, nodes: int) -> None:
         """Make room for ``nodes`` more cells."""
         corners = int(self.arrays.starts[self.piece_count])
-        for name, wanted in (
-            ("node", self.node_count + nodes),
-            ("piece", self.piece_count + nodes + 1),
-            ("corner", corners + 4 * nodes),
-        ):
-            for field in self._fields:
-                kind = {"corners": "corner", "starts": "piece", "piece_normal": "piece"}.get(field, "node")
-                if kind != name or field in ("samples", "sample_normals"):
-                    continue
-                old = self._fields[field]
-                if len(old) < wanted:
-                    fresh = np.zeros((wanted + wanted // 2, *old.shape[1:]), dtype=old.dtype)
-                    fresh[: len(old)] = old
-                    self._fields[field] = fresh
+        room = {
+            "corners": corners + 4 * nodes,
+            "starts": self.piece_count + nodes + 1,
+            "piece_normal": self.piece_count + nodes,
+        }
+        for name, old in self._fields.items():
+            wanted = room.get(name, self.node_count + nodes)
+            if name not in ("samples", "sample_normals") and len(old) < wanted:
+                fresh = np.zeros((wanted + wanted // 2, *old.shape[1:]), dtype=old.dtype)
+                fresh[: len(old)] = old
+                self._fields[name] = fresh
         self._refresh()
 
     def open(self, nodes: IntArray) -> None:
@@ -596,9 +593,10 @@ class Hierarchy:
         self.leaf_count += int(tree.children[nodes].sum()) - len(nodes)
 
     def leaves(self) -> IntArray:
-        """The leaves in the order of the tree."""
+        """The leaves, surface by surface, within one in the order of the tree."""
         found = np.empty(self.node_count, dtype=np.int64)
-        return found[: _leaves(self.arrays, found)].copy()
+        found = found[: _leaves(self.arrays, found)]
+        return found[np.argsort(self.arrays.surface[found], kind="stable")]
 
     def longest_edges(self, nodes: IntArray) -> FloatArray:
         """Longest edge of single quads and triangles, longest side of the box of others, (n,)."""

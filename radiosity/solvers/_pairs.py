@@ -77,23 +77,31 @@ def node_points(node, tree, cell, out):
 
 
 @njit(nogil=True, cache=True)
-def _views(points, count, node, tree, slack, values):
-    """Unoccluded form factor from each point to a node; the weighted mean and standard deviation."""
+def _view(x, y, z, nx, ny, nz, p0, p1, corners, starts, normals, slack):
+    """Unoccluded form factor from a point to the pieces ``p0..p1``."""
+    value = 0.0
+    for p in range(p0, p1):
+        value += max(open_share(x, y, z, nx, ny, nz, corners, starts[p], starts[p + 1], normals, p, slack), 0.0)
+    return value
+
+
+@njit(nogil=True, cache=True)
+def _views(points, count, own, node, tree, slack, values):
+    """Unoccluded form factor from each point of ``own`` to a node; the weighted mean, and how much it varies.
+
+    The latter is the standard deviation, or what the middle of a single quad or triangle is off the mean:
+    by symmetry the points of a rule may agree where the middle does not.
+    """
     p0, p1 = tree.piece0[node], tree.piece1[node]
     row = tree.sample[node]
     summed = tree.flat[node] == 1 or p1 - p0 <= SUMMED
     total = square = weight = 0.0
     for k in range(count):
-        value = 0.0
         if summed:
-            for p in range(p0, p1):
-                value += max(
-                    open_share(
-                        points[k, 0], points[k, 1], points[k, 2], points[k, 4], points[k, 5], points[k, 6],
-                        tree.corners, tree.starts[p], tree.starts[p + 1], tree.piece_normal, p, slack,
-                    ),
-                    0.0,
-                )  # fmt: skip
+            value = _view(
+                points[k, 0], points[k, 1], points[k, 2], points[k, 4], points[k, 5], points[k, 6], p0, p1,
+                tree.corners, tree.starts, tree.piece_normal, slack,
+            )  # fmt: skip
         else:
             value = _sampled_share(
                 points[k, 0:3], points[k, 4:7], tree.samples[row], tree.sample_normals[row], tree.area[node]
@@ -104,7 +112,14 @@ def _views(points, count, node, tree, slack, values):
         square += w * value * value
         weight += w
     mean = total / weight
-    return mean, math.sqrt(max(square / weight - mean * mean, 0.0))
+    varies = math.sqrt(max(square / weight - mean * mean, 0.0))
+    if summed and tree.sample[own] < 0:
+        middle = _view(
+            tree.centroid[own, 0], tree.centroid[own, 1], tree.centroid[own, 2], tree.normal[own, 0],
+            tree.normal[own, 1], tree.normal[own, 2], p0, p1, tree.corners, tree.starts, tree.piece_normal, slack,
+        )  # fmt: skip
+        varies = max(varies, abs(middle - mean))
+    return mean, varies
 
 
 @njit(nogil=True, cache=True)
@@ -156,6 +171,17 @@ def _gap(a, b, tree):
     square = 0.0
     for axis in range(3):
         off = max(tree.low[b, axis] - tree.high[a, axis], tree.low[a, axis] - tree.high[b, axis], 0.0)
+        square += off * off
+    return math.sqrt(square)
+
+
+@njit(nogil=True, cache=True)
+def _reach(node, other, tree):
+    """Distance from the centroid of a node to the box of another."""
+    square = 0.0
+    for axis in range(3):
+        c = tree.centroid[node, axis]
+        off = max(tree.low[other, axis] - c, c - tree.high[other, axis], 0.0)
         square += off * off
     return math.sqrt(square)
 
@@ -311,12 +337,23 @@ def measure(
         tally[CLOSED] += 1
         na = node_points(x, tree, cell, pa)
         nb = node_points(y, tree, cell, pb)
-        from_a, std_a = _views(pa, na, y, tree, geo.slack, va)
-        from_b, std_b = _views(pb, nb, x, tree, geo.slack, vb)
+        from_a, std_a = _views(pa, na, x, y, tree, geo.slack, va)
+        from_b, std_b = _views(pb, nb, y, x, tree, geo.slack, vb)
         one, two = from_a * tree.area[x], from_b * tree.area[y]
         off = abs(one - two)
-        # The rule whose values agree better among themselves is the better one.
-        value = one if std_a * two <= std_b * one else two
+        # The rule whose values agree better among themselves is the better one; what the two rules
+        # differ by is the other's.
+        at_a = std_a * from_b <= std_b * from_a
+        if at_a:
+            value, off_a, off_b = one, 0.0, off
+            doubt[i] = 0.5 * min(off, std_a * std_a * tree.area[x] / max(from_a, 1e-300))
+            ratio = tree.size[x] / max(_reach(x, y, tree), 1e-3 * tree.size[x])
+        else:
+            value, off_a, off_b = two, off, 0.0
+            doubt[i] = 0.5 * min(off, std_b * std_b * tree.area[y] / max(from_b, 1e-300))
+            ratio = tree.size[y] / max(_reach(y, x, tree), 1e-3 * tree.size[y])
+        # The error of a Gauss rule falls with the fourth power of size over distance.
+        doubt[i] = max(doubt[i], value * min(0.05 * ratio * ratio * ratio * ratio, 0.3))
         if both and min(one, two) <= 0.0:
             # Seen by no point, yet before each other's planes: a sliver above a horizon.
             value = 0.0
@@ -329,20 +366,19 @@ def measure(
                     )  # fmt: skip
             std_a = max(std_a, value / tree.area[x])
             std_b = max(std_b, value / tree.area[y])
-            off = 0.0
+            off_a = off_b = doubt[i] = 0.0
         exchange[i] = value
-        doubt[i] = 0.5 * off
         open_a, open_b = value / tree.area[x], value / tree.area[y]
-        open_vary_a, open_vary_b = max(std_a, 0.5 * off / tree.area[x]), max(std_b, 0.5 * off / tree.area[y])
+        open_vary_a, open_vary_b = max(std_a, 0.5 * off_a / tree.area[x]), max(std_b, 0.5 * off_b / tree.area[y])
         if not both:
             vary_a[i], vary_b[i] = open_vary_a, open_vary_b
             gap = _gap(x, y, tree)
             extent = max(0.0 if flat_a else tree.size[x], 0.0 if flat_b else tree.size[y])
-            if gap < extent:
-                # Too near for samples to tell: all that could arrive is in doubt.
+            if gap < 0.5 * extent:
+                # Too near for samples to tell: anything from nothing to a full view may arrive.
                 high = math.pi * gap * gap
-                vary_a[i] = 1.0 if high <= tree.area[y] else tree.area[y] / high
-                vary_b[i] = 1.0 if high <= tree.area[x] else tree.area[x] / high
+                vary_a[i] = 0.5 if high <= tree.area[y] else 0.5 * tree.area[y] / high
+                vary_b[i] = 0.5 if high <= tree.area[x] else 0.5 * tree.area[x] / high
                 state[i] = NEAR
             elif value == 0.0:
                 state[i] = DROPPED
@@ -395,11 +431,11 @@ def measure(
                 # The other end's visibility is taken to vary as much, relative to its form factor.
                 spread = other * deviation / own
                 if at_a:
-                    vary_a[i] = max(deviation, 0.5 * off / tree.area[x] * share)
-                    vary_b[i] = max(std_b * share, spread)
+                    vary_a[i] = deviation
+                    vary_b[i] = max(open_vary_b * share, spread)
                 else:
-                    vary_b[i] = max(deviation, 0.5 * off / tree.area[y] * share)
-                    vary_a[i] = max(std_a * share, spread)
+                    vary_b[i] = deviation
+                    vary_a[i] = max(open_vary_a * share, spread)
                 continue
         vary_a[i], vary_b[i] = open_vary_a, open_vary_b
         state[i] = RAYS
@@ -495,8 +531,8 @@ def apply_rays(pairs, counts, a, b, whole, starts, weights, blocked, area, excha
 
 @njit(nogil=True, cache=True)
 def judge(
-    a, b, vary_a, vary_b, state, area, flat, size, bright, uneven, detail, bias, weight, can_split, error, verdict,
-    need,
+    a, b, vary_a, vary_b, state, area, flat, size, bright, uneven, detail, bias, weight, share, can_split,
+    error, verdict, need,
 ):  # fmt: skip
     """What to do with each pair: 0 keep, 1 split the first end, 2 the second.
 
@@ -505,8 +541,8 @@ def judge(
     sender does).  Errors of the links to one receiver add up, so with the sums T of all of them the
     mean square error over all surfaces is the sum over links of ``error * T * A / total``, and the
     root of each link's term is what is held below ``error``.
-    ``weight`` holds ``sqrt(A / total)`` and what the receiver's own detail matters; ``bright`` and
-    ``uneven`` the mean and the deviation of each node's radiosity in units of the mean irradiance.
+    ``share`` holds ``sqrt(A / total)``, ``weight`` that times what a receiver's own detail matters;
+    ``bright`` and ``uneven`` the mean and the deviation of each node's radiosity in units of the mean irradiance.
     """
     for i in range(a.shape[0]):
         verdict[i] = 0
@@ -517,10 +553,10 @@ def judge(
         own_a, own_b = bright[y] * vary_a[i], bright[x] * vary_b[i]
         far_a, far_b = uneven[y] * vary_b[i] * area[y] / area[x], uneven[x] * vary_a[i] * area[x] / area[y]
         need_a = max(
-            math.sqrt(own_a * max(own_a, detail[x])) * weight[x], math.sqrt(far_b * max(far_b, bias[y])) * weight[y]
+            math.sqrt(own_a * max(own_a, detail[x])) * weight[x], math.sqrt(far_b * max(far_b, bias[y])) * share[y]
         )  # fmt: skip
         need_b = max(
-            math.sqrt(own_b * max(own_b, detail[y])) * weight[y], math.sqrt(far_a * max(far_a, bias[x])) * weight[x]
+            math.sqrt(own_b * max(own_b, detail[y])) * weight[y], math.sqrt(far_a * max(far_a, bias[x])) * share[x]
         )  # fmt: skip
         need[i] = max(need_a, need_b)
         if need[i] <= error:
@@ -542,17 +578,22 @@ def judge(
 
 @njit(nogil=True, cache=True)
 def tolerances(pairs, a, b, exchange, area, bright, weight, relative, floor, allowed):
-    """Error of the exchange area that each pair may keep."""
+    """Error of the exchange area that each pair may keep: ``relative`` if positive, else by ``floor``.
+
+    ``floor`` bounds the error of the irradiance, weighed as in :func:`judge`.
+    """
     for i in range(pairs.shape[0]):
         k = pairs[i]
         x, y = a[k], b[k]
+        if relative > 0.0:
+            allowed[i] = relative * exchange[k]
+            continue
         one, two = bright[y] * weight[x], bright[x] * weight[y]
-        small = math.inf
+        allowed[i] = math.inf
         if one > 0.0:
-            small = floor * area[x] / one
+            allowed[i] = floor * area[x] / one
         if two > 0.0:
-            small = min(small, floor * area[y] / two)
-        allowed[i] = max(relative * exchange[k], small)
+            allowed[i] = min(allowed[i], floor * area[y] / two)
 
 
 @njit(nogil=True, cache=True)

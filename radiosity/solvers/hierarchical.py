@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from radiosity.form_factors._links import occluder_arrays, workspace
 from radiosity.hierarchy import Hierarchy
+from radiosity.patches import PatchMesh
 from radiosity.solvers._pairs import (
     CLEAR,
     CUT,
@@ -48,11 +49,11 @@ from radiosity.solvers._pairs import (
     tolerances,
 )
 from radiosity.solvers._push_pull import deviations, expand, gather, pull, push, sort_links
-from radiosity.solvers.incident import incident_irradiance, light_spread
+from radiosity.solvers.incident import cosine_directions, incident_irradiance, incident_spread, points_of_elements
 from radiosity.solvers.progressive import remaining_bound
 from radiosity.solvers.solution import EnergyBook, Progress, ProgressEvent, Solution
 from workbench.accel.box_tree import BoxTree
-from workbench.accel.embree import EmbreeAccelerator
+from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
 from workbench.counters import Counters
 from workbench.culling.tally import add_tally, new_tally
 from workbench.errors import OptionError
@@ -60,6 +61,7 @@ from workbench.geometry.flat import Geometry
 from workbench.memory import require_memory
 from workbench.record import RunRecord
 from workbench.scene.model import Scene
+from workbench.shadow.sky import SkyLight
 
 __all__ = ["solve_hierarchical"]
 
@@ -82,8 +84,14 @@ GATHERED = 0.25
 """What an element's own detail counts where direct light is gathered: the nearby points that see it at all."""
 COARSER = (16.0, 16.0, 4.0, 1.0)
 """Link errors of the rounds in units of the last: emitters first, then with what they lit, then finer."""
-COVERED = 0.01
-"""Share of an element of a closed scene that must see nothing to count as covered (the floor under a box)."""
+EXACT_ELEMENTS, EXACT = 12, 1e-8
+"""Up to this many elements, if no more may be made, form factors are found to this error: a second at most."""
+FIRST_ERROR, LAST_ERROR = 1e-2, 1e-7
+"""Link errors between which a wanted number of elements is sought."""
+COVERED = 0.005
+"""Share of a polygon's view in a closed scene that must be missing before its elements are asked for covers."""
+COVER_RAYS = 64
+"""Rays an element that tell how much of it is covered."""
 UNEVEN = 2.0
 """What an uneven sender counts against a receiver's own detail: it shifts means, which reflection hands on."""
 PAIR_BYTES = 120
@@ -135,17 +143,17 @@ class _Links:
 class _Exchange:
     """The operator from radiosity of the leaves to their irradiance, over all links."""
 
-    def __init__(self, tree: Hierarchy, links: _Links, pool: ThreadPoolExecutor, *, ignore_unseen: bool = True) -> None:
+    def __init__(self, tree: Hierarchy, links: _Links, pool: ThreadPoolExecutor, *, with_unseen: bool = False) -> None:
         self.tree, self.pool = tree, pool
         self.leaves = tree.leaves()
         self.area = tree.arrays.area[self.leaves]
         self.scale = np.ones(len(self.leaves))
+        self.wanted: FloatArray | None = None
         n, m = tree.node_count, len(links)
         self.start = np.zeros(n + 1, dtype=np.int64)
         self.column = np.zeros(2 * m, dtype=np.int32)
         self.factor = np.zeros(2 * m)
-        # What waits for light carries none.
-        exchange = np.where(links.state > 0, links.exchange, 0.0) if ignore_unseen else links.exchange
+        exchange = links.exchange if with_unseen else np.where(links.state > 0, links.exchange, 0.0)
         sort_links(links.a, links.b, exchange, tree.arrays.area, self.start, self.column, self.factor)
 
     def up(self, values: FloatArray) -> FloatArray:
@@ -217,6 +225,7 @@ class _Solver:
             self.tree = Hierarchy(scene, geometry)
             self.geo = occluder_arrays(geometry, BoxTree.build(geometry))
             self.accelerator = EmbreeAccelerator(geometry, workers=workers)
+        self.lit_from_outside = bool(scene.lights) or SkyLight.of_scene(scene) is not None
         materials = [surface.material for surface in scene.surfaces]
         self.rho = np.stack([m.reflectance for m in materials])
         self.emission = np.stack([m.emission for m in materials])
@@ -236,6 +245,13 @@ class _Solver:
 
     def close(self) -> None:
         self.pool.shutdown()
+
+    @property
+    def levels(self) -> int:
+        """Halvings of a receiver in search of shadow boundaries."""
+        if self.relative == 0.0:
+            return CUT_LEVELS
+        return 5 if self.relative >= 1e-3 else 7 if self.relative >= 1e-5 else 20
 
     # ---- what nodes are worth ------------------------------------------------------------------
 
@@ -337,8 +353,8 @@ class _Solver:
         verdict, need = np.empty(len(pairs), dtype=np.int8), np.empty(len(pairs))
         judge(
             pairs.a, pairs.b, pairs.vary_a, pairs.vary_b, pairs.state, self.tree.arrays.area, self.tree.arrays.flat,
-            self.tree.arrays.size, self.bright, self.uneven, self.detail, self.bias, self.weight, self.can_split,
-            error, verdict, need,
+            self.tree.arrays.size, self.bright, self.uneven, self.detail, self.bias, self.weight, self.plain,
+            self.can_split, error, verdict, need,
         )  # fmt: skip
         return verdict, need
 
@@ -353,7 +369,7 @@ class _Solver:
         def work(first: int, last: int, scratch: Any, tally: NDArray) -> None:
             finish(
                 first, last, kept, allowed, pairs.a, pairs.b, pairs.state, pairs.offset, pairs.count, self.candidates,
-                self.bright, self.tree.arrays, self.geo, CUT_LIMIT, CUT_LEVELS, pairs.exchange, pairs.doubt, scratch,
+                self.bright, self.tree.arrays, self.geo, CUT_LIMIT, self.levels, pairs.exchange, pairs.doubt, scratch,
                 tally,
             )  # fmt: skip
 
@@ -368,7 +384,7 @@ class _Solver:
         else:
             whole[fresh] = pairs.exchange[fresh]
             again = rays & was & (pairs.doubt[kept] > allowed)
-            ratio = pairs.doubt[kept][again] / np.maximum(allowed[again], 1e-300)
+            ratio = np.minimum(pairs.doubt[kept][again] / np.maximum(allowed[again], 1e-300), float(MOST_RAYS))
             more = np.concatenate([fresh, kept[again]])
             # Noise falls with the root of the rays.
             wanted = np.concatenate([np.full(len(fresh), 4.0 * FIRST_RAYS), FIRST_RAYS * ratio**2])
@@ -426,54 +442,39 @@ class _Solver:
 
     def refine(self, error: float, report: Callable[[int], None]) -> None:
         """Split and measure until no link is off by more than ``error``, or nothing may be split."""
-        done: list[_Links] = []
-        store = self.links
-        lit = (self.bright[store.a] > 0) | (self.bright[store.b] > 0)
-        waiting = (store.state <= 0) & lit
-        frontier = store.take(waiting)
-        store = store.take(~waiting)
+        lit = (self.bright[self.links.a] > 0) | (self.bright[self.links.b] > 0)
+        waiting = (self.links.state <= 0) & lit
+        frontier, store = self.links.take(waiting), self.links.take(~waiting)
         verdict, need = self._judge(store, error)
-        pending: list[_Links] = []
+        chosen = verdict > 0
+        pairs, verdict, need = store.take(chosen), verdict[chosen], need[chosen]
+        store = store.take(~chosen)
+        done = [store]
         try:
-            kept = np.flatnonzero((verdict == 0) & (store.state > 0))
-            self._finish(store, kept, None, error)
-            while True:
-                report(len(store) + sum(len(part) for part in done) + len(frontier))
+            self._finish(store, np.flatnonzero(store.state > 0), None, error)
+            while len(frontier) or len(pairs):
+                report(sum(len(part) for part in done) + len(frontier) + len(pairs))
                 if len(frontier):
-                    pending = [frontier]
                     whole = self._measure(frontier)
                     alive = frontier.state != DROPPED
                     frontier, whole = frontier.take(alive), whole[alive]
-                    verdict_new, need_new = self._judge(frontier, error)
-                    kept = np.flatnonzero(verdict_new == 0)
+                    fresh, fresh_need = self._judge(frontier, error)
+                    kept, more = np.flatnonzero(fresh == 0), np.flatnonzero(fresh)
                     self._finish(frontier, kept, whole, error)
                     done.append(frontier.take(kept))
-                    split = np.flatnonzero(verdict_new)
-                    pairs, verdict_now, need_now = frontier.take(split), verdict_new[split], need_new[split]
-                    pending = [pairs]
-                else:
-                    pairs, verdict_now, need_now = store.take(verdict > 0), verdict[verdict > 0], need[verdict > 0]
-                    pending = [pairs]
-                    store = store.take(verdict == 0)
-                    verdict = np.zeros(len(store), dtype=np.int8)
-                if not len(pairs):
-                    if not (verdict > 0).any():
-                        pending = []
-                        break
-                    frontier = pairs
-                    continue
-                parts, refused = self._split(pairs, verdict_now, need_now)
-                if refused.any():
-                    left = pairs.take(refused)
-                    self._finish(left, np.arange(len(left)), None, error)
-                    done.append(left)
+                    pairs = _Links.join([pairs, frontier.take(more)])
+                    verdict, need = np.append(verdict, fresh[more]), np.append(need, fresh_need[more])
+                    frontier = frontier.take(more[:0])
+                parts, refused = self._split(pairs, verdict, need)
+                left = pairs.take(refused)
+                self._finish(left, np.arange(len(left)), None, error)
                 dark = (self.bright[parts.a] == 0) & (self.bright[parts.b] == 0)
-                done.append(parts.take(dark))
-                frontier = parts.take(~dark)
-                pending = [frontier]
+                done += [left, parts.take(dark)]
+                frontier, pairs = parts.take(~dark), pairs.take(np.zeros(0, dtype=np.int64))
+                verdict, need = verdict[:0], need[:0]
         finally:
             # Also when interrupted: what is waiting keeps its share of the pair that was split.
-            self.links = _Links.join([store, *done, *pending])
+            self.links = _Links.join([*done, frontier, pairs])
             self._compact()
 
     def _compact(self) -> None:
@@ -505,12 +506,12 @@ class _Solver:
             self._grown()
 
     def refine_for_lights(self, error: float, unit: FloatArray) -> None:
-        """Split leaves over which the light of lights without surface varies by more than ``error``."""
-        if not self.scene.lights:
+        """Split leaves over which the light from outside the mesh varies by more than ``error``."""
+        if not self.lit_from_outside:
             return
         fresh = self.tree.leaves()
         while len(fresh):
-            spread = light_spread(self.scene, self.tree.mesh(fresh), self.accelerator, seed=self.seed)
+            spread = incident_spread(self.scene, self.tree.mesh(fresh), self.accelerator, seed=self.seed)
             need = (spread / unit).max(axis=1) * self.weight[fresh]
             chosen = np.flatnonzero((need > error) & self.can_split[fresh])
             if self.max_elements is not None:
@@ -526,6 +527,11 @@ class _Solver:
             fresh = np.repeat(arrays.child[nodes], arrays.children[nodes])
             counts = arrays.children[nodes]
             fresh = fresh + np.arange(len(fresh)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+    def waiting(self) -> bool:
+        """Whether there are links that were dark when last looked at and are not now."""
+        links = self.links
+        return bool(((links.state <= 0) & ((self.bright[links.a] > 0) | (self.bright[links.b] > 0))).any())
 
     def illuminate(self, radiosity: FloatArray, exchange: _Exchange, unit: FloatArray) -> None:
         """Take the brightness of all nodes from the radiosity of the leaves."""
@@ -550,7 +556,7 @@ class _Solver:
         two = np.where(a == b, 0.0, 1.0)  # a link of a node with itself receives once
 
         def at_leaves(one: FloatArray, other: FloatArray) -> FloatArray:
-            nodes = np.bincount(a, one, n) + np.bincount(b, other * two, n)
+            nodes = np.asarray(np.bincount(a, one, n) + np.bincount(b, other * two, n), dtype=np.float64)
             return exchange.down(nodes[:, None])[:, 0]
 
         detail = at_leaves(bright[b] * links.vary_a, bright[a] * links.vary_b)
@@ -596,36 +602,81 @@ def _conjugate_gradients(
     return z
 
 
-def _row_targets(exchange: _Exchange, links: _Links, closed: bool, largest_rho: float, record: RunRecord) -> FloatArray:
+def _row_targets(solver: _Solver, exchange: _Exchange, mesh: PatchMesh, closed: bool) -> FloatArray:
     """Row sums wanted of the leaves; puts those found, and the doubt of them, into the record."""
+    links, record = solver.links, solver.record
     sums = exchange(np.ones((len(exchange.area), 1)))[:, 0]
     n = exchange.tree.node_count
     area = exchange.tree.arrays.area[:n]
-    doubt = np.bincount(links.a, links.doubt, n) + np.where(
-        True, np.bincount(links.b, np.where(links.a == links.b, 0.0, links.doubt), n), 0.0
+    a, b, known = links.a, links.b, links.state > 0
+    other = known & (a != b)
+    off = np.asarray(np.bincount(a, np.where(known, links.doubt, 0.0), n), dtype=np.float64)
+    off += np.bincount(b, np.where(other, links.doubt, 0.0), n)
+    off /= area
+    # The mean over a node is off by the doubts of its links, a leaf's own row by their detail, too.
+    detail = np.bincount(a, np.where(known, links.vary_a, 0.0), n) + np.bincount(
+        b, np.where(other, links.vary_b, 0.0), n
     )
-    stated = exchange.down((doubt / area)[:, None])[:, 0]
+    stated = exchange.down(np.column_stack([off, off + detail]))
     record.errors["row_sum"] = {
         "min": float(sums.min()),
         "mean": float(np.average(sums, weights=exchange.area)),
         "max": float(sums.max()),
-        "stated_error": float(stated.max()),
+        "stated_error": float(stated[:, 1].max()),
         "rows": len(sums),
     }
     if not closed:
         # Rows above 1 are errors as those below are; cutting only the former would lose light.
-        return np.minimum(sums, 1.0) if sums.max() * largest_rho >= 1.0 else sums
-    covered = 1.0 - sums > np.maximum(stated, COVERED)
-    record.results["covered_elements"] = int(covered.sum())
-    return np.where(covered, sums, 1.0)
+        return np.minimum(sums, 1.0) if sums.max() * solver.rho.max() >= 1.0 else sums
+    # A polygon that sees too little as a whole may be covered in part (the floor under a box).
+    key = np.where(mesh.element_polygon >= 0, 2 * mesh.element_polygon + (mesh.element_side > 0), -1)
+    _, place = np.unique(key, return_inverse=True)
+    weight = np.bincount(place, exchange.area)
+    seen = np.bincount(place, exchange.area * sums) / weight
+    doubt = np.bincount(place, exchange.area * stated[:, 0]) / weight
+    asked = np.flatnonzero((1.0 - seen > np.maximum(doubt, COVERED))[place] & (mesh.element_polygon >= 0))
+    wanted = np.ones(len(sums))
+    wanted[asked] = _visible_shares(solver, mesh, asked)
+    wanted[sums <= 0.0] = 0.0
+    record.results["covered_elements"] = int((wanted < 1.0).sum())
+    return wanted
 
 
-def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, closed: bool, limit: float) -> None:
+def _visible_shares(solver: _Solver, mesh: PatchMesh, chosen: IntArray) -> FloatArray:
+    """Share of each chosen element's view, (k,), that ends at a front: in a closed scene all but what is covered.
+
+    Rays from under a box end at the backs of its sides.
+    """
+    tracer, geometry = solver.accelerator, solver.geometry
+    two_sided = np.asarray([m.two_sided for m in geometry.surface_material])[geometry.polygon_surface]
+    out = np.empty(len(chosen))
+    step = BLOCK_RAYS // COVER_RAYS
+    centre, scale = tracer.frame
+    for first in range(0, len(chosen), step):
+        own = chosen[first : first + step]
+        origins = points_of_elements(mesh, own, COVER_RAYS, solver.seed)
+        normals = mesh.element_normal[own]
+        directions = cosine_directions(normals, COVER_RAYS, [solver.seed, first])
+        origins += tracer.offset * np.repeat(normals, COVER_RAYS, axis=0)
+        hit = tracer.nearest_raw(
+            ((origins - centre) * scale).astype(np.float32), (directions * scale).astype(np.float32)
+        )
+        facing = np.einsum("ij,ij->i", directions, geometry.polygon_normal[hit]) < 0
+        out[first : first + step] = ((hit >= 0) & (facing | two_sided[hit])).reshape(-1, COVER_RAYS).mean(axis=1)
+        solver.counters.add(rays=len(hit))
+    return out
+
+
+def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, limit: float) -> None:
     """Solve for the leaves over the links there are; fills the solution and its energy book."""
     mesh, book = solution.mesh, solution.book
     area = exchange.area
-    wanted = _row_targets(exchange, solver.links, closed, float(solver.rho.max()), solver.record)
-    exchange.balance(wanted)
+    # Rows are whole only once all links that carry light are there.
+    closed = solver.scene.closed and not solver.waiting()
+    if exchange.wanted is None:
+        exchange.wanted = _row_targets(solver, exchange, mesh, closed)
+        exchange.balance(exchange.wanted)
+    wanted = exchange.wanted
     visible = np.where(wanted > 0, wanted, 1.0)[:, None] if closed else np.ones((len(area), 1))
     incident = solution.direct_irradiance
     sent = mesh.emission + mesh.reflectance * incident / visible
@@ -647,15 +698,6 @@ def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, cl
     book.received = area @ (incident + arriving)
     book.absorbed = area @ ((1.0 - mesh.reflectance) * (incident + arriving))
     book.escaped = book.shot - area @ arriving
-
-
-def _forecast_unit(scene: Scene, mesh_area: FloatArray, emission: FloatArray, rho: FloatArray) -> FloatArray:
-    """First guess of the mean irradiance a band, from the power there is. [W m-2]"""
-    total = mesh_area.sum()
-    mean_rho = np.minimum(mesh_area @ rho / total, 0.99)
-    unit = mesh_area @ emission / total
-    unit = unit / (1.0 - mean_rho) if scene.closed else unit
-    return np.where(unit > 0, unit, max(float(unit.max(initial=0.0)), 1e-300))
 
 
 def solve_hierarchical(
@@ -747,112 +789,107 @@ def solve_hierarchical(
     try:
         if max_edge is not None:
             solver.divide(max_edge)
+        if form_factor_error is None and (max_elements or math.inf) <= solver.tree.leaf_count <= EXACT_ELEMENTS:
+            solver.relative = EXACT
         return _rounds(solver, link_error, tolerance, progress)
     finally:
         solver.close()
 
 
 def _errors_of_rounds(solver: _Solver, link_error: float | None) -> Iterable[float]:
-    """Link errors of the rounds, each finer than the last."""
+    """Link errors of the rounds, none coarser than the one before."""
     if link_error is not None:
         for factor in COARSER:
             yield factor * link_error
-        return
-    assert solver.max_elements is not None
-    error = 1e-2
-    yield error
-    while True:
+        error = link_error
+    else:
+        assert solver.max_elements is not None
+        error = FIRST_ERROR
         yield error
-        if solver.tree.leaf_count >= 0.98 * solver.max_elements or error < 1e-7:
-            return
-        error *= 0.5
+        yield error
+        while solver.tree.leaf_count < 0.98 * solver.max_elements and error > LAST_ERROR:
+            error *= 0.5
+            yield error
+    # Light that goes round more corners than there were rounds.
+    while solver.waiting():
+        yield error
 
 
 def _rounds(solver: _Solver, link_error: float | None, tolerance: float, progress: Progress | None) -> Solution:
     """Refine and solve, round by round."""
-    record, tree, scene = solver.record, solver.tree, solver.scene
+    record, tree = solver.record, solver.tree
     begin = time.perf_counter()
-    solution: Solution | None = None
-    leaves = tree.leaves()
-    surface = tree.arrays.surface[leaves]
-    unit = _forecast_unit(scene, tree.arrays.area[leaves], solver.emission[surface], solver.rho[surface])
+    final = link_error if link_error is not None else LAST_ERROR
+
+    def report(links: int) -> None:
+        if progress is not None:
+            seconds = time.perf_counter() - begin
+            progress(ProgressEvent(links, error, final, seconds, f"{tree.leaf_count} elements"))
+
+    unit = _first_light(solver)
     stopped = ""
-    before: float | None = None
-    for step, error in enumerate(_errors_of_rounds(solver, link_error)):
-        final = link_error if link_error is not None else error
-        if before is not None:
-            # What the sums will be after this round, about.
-            solver.detail *= error / before
-            solver.bias *= error / before
+    before = math.inf
+    for error in _errors_of_rounds(solver, link_error):
+        # What the sums of errors will be after this round, about.
+        solver.detail *= error / before
+        solver.bias *= error / before
         before = error
-
-        def report(links: int, error: float = error, final: float = final) -> None:
-            if progress is not None:
-                seconds = time.perf_counter() - begin
-                progress(ProgressEvent(links, error, final, seconds, f"linking, {tree.leaf_count} elements"))
-
         try:
-            if step == 0:
-                leaves = tree.leaves()
-                incident = _incident(solver, leaves)
-                lit = tree.arrays.area[leaves] @ incident / solver.total_area
-                unit = np.maximum(unit, lit)
-                with record.stage("incident light"):
-                    solver.refine_for_lights(error, unit)
-                leaves = tree.leaves()
-                incident = _incident(solver, leaves)
-                surface = tree.arrays.surface[leaves]
-                first = solver.emission[surface] + solver.rho[surface] * incident
-                empty = _Exchange(tree, solver.links.take(np.zeros(0, np.int64)), solver.pool)
-                solver.illuminate(first, empty, unit)
-            elif scene.lights:
-                with record.stage("incident light"):
-                    solver.refine_for_lights(error, unit)
+            with record.stage("incident light"):
+                solver.refine_for_lights(error, unit)
             with record.stage("links"):
                 solver.refine(error, report)
         except KeyboardInterrupt:
             stopped = "interrupted"
         with record.stage("solve"):
-            whole = (
-                step > 0
-                and not (
-                    (solver.links.state <= 0)
-                    & ((solver.bright[solver.links.a] > 0) | (solver.bright[solver.links.b] > 0))
-                ).any()
-            )
-            solution, exchange = _solved(solver, closed=scene.closed and whole, limit=1e-3, ignore_unseen=not stopped)
-            area = exchange.area
-            found = area @ solution.irradiance / area.sum()
+            solution, exchange = _solved(solver, limit=1e-3, interrupted=bool(stopped))
+            found = solution.mean_irradiance
             unit = np.where(found > 0, found, unit)
             solver.illuminate(solution.radiosity, exchange, unit)
             solver.accumulate(exchange)
         if stopped:
             break
-    assert solution is not None
     with record.stage("solve"):
         limit = 1e-3
         while remaining_bound(solution) > tolerance and limit > 1e-15:
             limit *= 1e-3
-            _solve_links(solver, exchange, solution, closed=scene.closed and whole, limit=limit)
+            _solve_links(solver, exchange, solution, limit=limit)
     solution.converged = not stopped
     solution.stopped = stopped or "tolerance"
-    _report(solver, solution, exchange, unit)
+    _report(solver, solution, exchange)
     return solution
+
+
+def _first_light(solver: _Solver) -> FloatArray:
+    """Make the emitters bright, and what is lit from outside the mesh; a guess at the mean irradiance (bands,)."""
+    tree, scene, arrays = solver.tree, solver.scene, solver.tree.arrays
+    leaves = tree.leaves()
+    incident = _incident(solver, leaves)
+    area, surface = arrays.area[leaves], arrays.surface[leaves]
+    emission, rho = solver.emission[surface], solver.rho[surface]
+    unit = area @ (emission + incident) / area.sum()
+    if scene.closed:
+        unit = unit / (1.0 - np.minimum(area @ rho / area.sum(), 0.99))
+    unit = np.where(unit > 0, unit, max(float(unit.max(initial=0.0)), 1e-300))
+    none = _Exchange(tree, solver.links.take(np.zeros(0, dtype=np.int64)), solver.pool)
+    solver.illuminate(emission + rho * incident, none, unit)
+    return unit
 
 
 def _incident(solver: _Solver, leaves: IntArray) -> FloatArray:
     """Irradiance of leaves from lights without surface and from the background."""
     scene = solver.scene
-    if not scene.lights and (scene.closed or not scene.background.any()):
+    if not solver.lit_from_outside:
         return np.zeros((len(leaves), scene.bands))
     with solver.record.stage("incident light"):
         return incident_irradiance(scene, solver.tree.mesh(leaves), solver.accelerator, seed=solver.seed)
 
 
-def _solved(solver: _Solver, *, closed: bool, limit: float, ignore_unseen: bool) -> tuple[Solution, _Exchange]:
+def _solved(solver: _Solver, *, limit: float, interrupted: bool) -> tuple[Solution, _Exchange]:
     """The solution over the links and leaves that there are."""
-    tree, links = solver.tree, solver.links
-    exchange = _Exchange(tree, links, solver.pool, ignore_unseen=ignore_unseen)
+    tree = solver.tree
+    # What waits for light carries none; what was about to be measured has its share of a measured link.
+    exchange = _Exchange(tree, solver.links, solver.pool, with_unseen=interrupted)
     mesh = tree.mesh(exchange.leaves)
     incident = _incident(solver, exchange.leaves)
     solution = Solution(
@@ -865,11 +902,11 @@ def _solved(solver: _Solver, *, closed: bool, limit: float, ignore_unseen: bool)
         record=solver.record,
         direct_irradiance=incident,
     )
-    _solve_links(solver, exchange, solution, closed=closed, limit=limit)
+    _solve_links(solver, exchange, solution, limit=limit)
     return solution, exchange
 
 
-def _report(solver: _Solver, solution: Solution, exchange: _Exchange, unit: FloatArray) -> None:
+def _report(solver: _Solver, solution: Solution, exchange: _Exchange) -> None:
     """Put what the run knows of its own errors into the record."""
     record, links = solver.record, solver.links
     record.counters.merge(solver.counters)

@@ -20,9 +20,10 @@ from workbench.scene.model import Light, Scene
 from workbench.shadow.occlusion import Shader
 from workbench.shadow.sky import SkyLight
 
-__all__ = ["incident_irradiance", "light_spread"]
+__all__ = ["cosine_directions", "incident_irradiance", "incident_spread", "points_of_elements"]
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 POINTS = 4
 """Points an element at which lights without surface and the sky are evaluated."""
@@ -56,23 +57,31 @@ def _smooth_points(corners, piece_start, element_piece, first, last, out, fits):
 
 
 @njit(nogil=True, cache=True)
-def _element_points(corners, piece_start, element_piece, area, first, last, count, seed, out):
-    for e in range(first, last):
+def _chosen_points(corners, piece_start, element_piece, area, chosen, count, seed, out):
+    for i in range(chosen.shape[0]):
+        e = chosen[i]
         h = stream(e, 0, seed)
         s1 = np.float64(h & np.uint64(0xFFFFFF)) / 16777216.0
         s2 = np.float64((h >> np.uint64(24)) & np.uint64(0xFFFFFF)) / 16777216.0
         for k in range(count):
             place_on_pieces(
                 corners, piece_start, element_piece[e], element_piece[e + 1], area[e],
-                (s1 + (k + 0.5) / _G2) % 1.0, (s2 + (k + 0.5) / _G2**2) % 1.0, out[(e - first) * count + k],
+                (s1 + (k + 0.5) / _G2) % 1.0, (s2 + (k + 0.5) / _G2**2) % 1.0, out[i * count + k],
             )  # fmt: skip
 
 
+def points_of_elements(mesh: PatchMesh, chosen: IntArray, count: int, seed: int) -> FloatArray:
+    """Points (k * count, 3), ``count`` on each chosen element, uniform by area."""
+    points = np.empty((len(chosen), count, 3))
+    _chosen_points(
+        mesh.corners, mesh.piece_start, mesh.element_piece, mesh.element_area, chosen, count, seed,
+        points.reshape(-1, 3),
+    )  # fmt: skip
+    return points.reshape(-1, 3)
+
+
 def _points(mesh: PatchMesh, first: int, last: int, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    points = np.empty(((last - first) * count, 3))
-    _element_points(
-        mesh.corners, mesh.piece_start, mesh.element_piece, mesh.element_area, first, last, count, seed, points
-    )
+    points = points_of_elements(mesh, np.arange(first, last), count, seed)
     return points, np.repeat(mesh.element_normal[first:last], count, axis=0)
 
 
@@ -149,23 +158,29 @@ def _from_sky(
     return sky.irradiance(shares.reshape(-1, count, 2).mean(axis=1))
 
 
-def _sky_by_rays(
-    points: FloatArray, normals: FloatArray, count: int, seed: list[int], sky: SkyLight, shader: Shader
-) -> FloatArray:
-    """What :meth:`SkyLight.shares` gives, from ``count`` cosine-distributed rays a point."""
+def cosine_directions(normals: FloatArray, count: int, seed: list[int]) -> FloatArray:
+    """Cosine-distributed unit directions (n * count, 3) about normals (n, 3), ``count`` each."""
     rng = np.random.default_rng(seed)
-    shift = np.repeat(rng.random((len(points), 2)), count, axis=0)
-    k = np.tile(np.arange(count), len(points))
+    shift = np.repeat(rng.random((len(normals), 2)), count, axis=0)
+    k = np.tile(np.arange(count), len(normals))
     u = ((k + 0.5) / count + shift[:, 0]) % 1.0
     phi = 2.0 * math.pi * ((k / 1.6180339887498949 + shift[:, 1]) % 1.0)
-    points, normals = np.repeat(points, count, axis=0), np.repeat(normals, count, axis=0)
+    normals = np.repeat(normals, count, axis=0)
     # Malley's method: cosine-weighted directions are a disk lifted to the hemisphere.
     radius, height = np.sqrt(u), np.sqrt(1.0 - u)
     helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     a = np.cross(helper, normals)
     a /= np.linalg.norm(a, axis=1)[:, None]
     b = np.cross(normals, a)
-    along = a * (radius * np.cos(phi))[:, None] + b * (radius * np.sin(phi))[:, None] + normals * height[:, None]
+    return a * (radius * np.cos(phi))[:, None] + b * (radius * np.sin(phi))[:, None] + normals * height[:, None]
+
+
+def _sky_by_rays(
+    points: FloatArray, normals: FloatArray, count: int, seed: list[int], sky: SkyLight, shader: Shader
+) -> FloatArray:
+    """What :meth:`SkyLight.shares` gives, from ``count`` cosine-distributed rays a point."""
+    along = cosine_directions(normals, count, seed)
+    points, normals = np.repeat(points, count, axis=0), np.repeat(normals, count, axis=0)
     free = ~shader.tracer.occluded(points + shader.tracer.offset * normals, along, np.inf)
     above, radiance = sky.relative(along)
     return np.stack(
@@ -213,19 +228,15 @@ def incident_irradiance(
     return out
 
 
-def light_spread(
-    scene: Scene, mesh: PatchMesh, tracer: EmbreeAccelerator, *, points: int = 16, seed: int = 0
+def incident_spread(
+    scene: Scene, mesh: PatchMesh, tracer: EmbreeAccelerator, *, sky_rays: int = 128, seed: int = 0
 ) -> FloatArray:
-    """How much the light of lights without surface varies over each element.
+    """How much what :func:`incident_irradiance` finds varies over each element.
 
     Parameters
     ----------
-    scene, mesh : Scene, PatchMesh
-    tracer : EmbreeAccelerator
-        Over the scene's geometry.
-    points : int
-        Points an element.
-    seed : int
+    scene, mesh, tracer, sky_rays, seed
+        As there.
 
     Returns
     -------
@@ -233,14 +244,27 @@ def light_spread(
         Standard deviation of the irradiance over the element. [W m-2]
     """
     out = np.zeros((mesh.element_count, mesh.bands))
-    step = max(1, BLOCK_RAYS // points)
+    step = max(1, BLOCK_RAYS // MORE_POINTS)
     for first in range(0, mesh.element_count, step):
         last = min(first + step, mesh.element_count)
-        where, normals = _points(mesh, first, last, points, seed)
-        total = np.zeros((last - first, points, mesh.bands))
+        points, normals = _points(mesh, first, last, MORE_POINTS, seed)
+        total = np.zeros((last - first, MORE_POINTS, mesh.bands))
         for light in scene.lights:
             samples = POINTS if light.kind == "linear" else 1
-            value = sum(_from_light(light, where, normals, tracer, k) for k in range(samples)) / samples
-            total += np.asarray(value).reshape(-1, points, 1) * light.power
+            seen = sum(_from_light(light, points, normals, tracer, k)[1] for k in range(samples)) / samples
+            total += np.asarray(seen).reshape(-1, MORE_POINTS, 1) * light.power
         out[first:last] = total.std(axis=1)
+    sky = SkyLight.of_scene(scene)
+    if sky is not None:
+        shader = Shader(Geometry.from_scene(scene))
+        for first in range(0, mesh.element_count, step):
+            last = min(first + step, mesh.element_count)
+            points, normals = _points(mesh, first, last, POINTS, seed)
+            own = np.repeat(mesh.element_polygon[first:last], POINTS)
+            shares = sky.shares(shader, points, normals, own_polygon=own, error=1e-3)
+            crowded = np.flatnonzero(np.isnan(shares[:, 0]))
+            if len(crowded):
+                shares[crowded] = _sky_by_rays(points[crowded], normals[crowded], sky_rays, [seed, first], sky, shader)
+            spread = sky.irradiance(shares).reshape(-1, POINTS, mesh.bands).std(axis=1)
+            out[first:last] = np.hypot(out[first:last], spread)
     return out

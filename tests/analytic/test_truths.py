@@ -24,7 +24,7 @@ from workbench.geometry.tessellation import sphere_mesh
 from workbench.scene.library import box_surface, diffuse, sphere_surface, unit_cube
 from workbench.scene.model import Scene, Surface
 
-METHODS = ("direct", "progressive")
+METHODS = ("direct", "hierarchical", "progressive")
 each_method = pytest.mark.parametrize("method", METHODS)
 
 
@@ -244,7 +244,7 @@ def test_huge_plates_tend_to_infinite_ones(name, method):
     assert np.abs(solution.radiosity[:, 0] / case["value"] - 1).max() < 1e-6
 
 
-@each_method
+@pytest.mark.parametrize("method", ["direct", "progressive"])
 @each_truth("rad/L-room/")
 def test_l_room(name, method):
     case = truth(name)

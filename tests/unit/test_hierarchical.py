@@ -1,0 +1,281 @@
+"""The hierarchical solver: its tree, its energy, its row sums, its agreement with the judge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from radiosity_scenes import UNIT, cube_with_emitter, each_truth, standing_box, truth
+
+import radiosity
+import workbench
+from radiosity.form_factors.analytic import point_to_polygon
+from radiosity.hierarchy import Hierarchy
+from radiosity.solvers import hierarchical
+from workbench import memory
+from workbench.errors import MemoryForecastError, OptionError
+from workbench.geometry.flat import Geometry
+from workbench.record import RunRecord
+from workbench.scene.library import box_surface, diffuse, sphere_surface, unit_cube
+from workbench.scene.model import Scene, Surface
+
+
+def solve(scene, **options):
+    return radiosity.solve(scene, **{"method": "hierarchical", "workers": 1, **options})
+
+
+def room_with_ball(*, closed=True):
+    room = box_surface("room", diffuse("wall", 0.6), *UNIT, inward=True, omit=["+z"])
+    lamp = box_surface("lamp", diffuse("lamp", 0.3, 5.0), *UNIT, inward=True, omit=["-x", "+x", "-y", "+y", "-z"])
+    ball = sphere_surface("ball", diffuse("ball", 0.5), [0.5, 0.5, 0.35], 0.2, facet_error=0.002)
+    return Scene("ball", (room, lamp, ball), bands=1, closed=closed)
+
+
+def sheet_over_floor(side, *, height=1.0, two_sided=False):
+    def square(half, z, turned=False):
+        ring = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], dtype=float)
+        return ring[::-1] if turned else ring
+
+    floor = Surface.from_polygons("floor", diffuse("floor", 0.5), [square(2.0, 0.0)])
+    lamp = Surface.from_polygons("lamp", diffuse("lamp", 0.0, 1.0), [square(0.5, 2.0, turned=True)])
+    sheet = Surface.from_polygons(
+        "sheet", replace(diffuse("sheet", 0.0), two_sided=two_sided), [square(side / 2, height)]
+    )
+    return Scene("sheet", (floor, lamp, sheet), bands=1)
+
+
+def l_room(emitter):
+    plan = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
+    floor = np.column_stack([plan, np.zeros(6)])
+    walls = [
+        np.array([[*a, 0], [*a, 3], [*b, 3], [*b, 0]], dtype=float)
+        for a, b in zip(plan, np.roll(plan, -1, 0), strict=True)
+    ]
+    surfaces = tuple(
+        Surface.from_polygons(str(i), diffuse(str(i), 0.5, float(i == emitter)), [polygon])
+        for i, polygon in enumerate([*walls, (floor + [0, 0, 3])[::-1], floor])
+    )
+    return Scene("L", surfaces, bands=1, closed=True)
+
+
+# The tree
+
+
+@pytest.mark.parametrize("scene", ["cornell-box", "office", "sculpture-room"])
+def test_leaves_tile_the_surfaces_however_they_are_opened(scene):
+    loaded = workbench.load(scene)
+    geometry = Geometry.from_scene(loaded)
+    tree = Hierarchy(loaded, geometry)
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        leaves = tree.leaves()
+        assert len(leaves) == tree.leaf_count == len(set(leaves.tolist()))
+        mesh = tree.mesh(leaves)
+        assert mesh.element_area.sum() == pytest.approx(geometry.polygon_area.sum(), rel=1e-12)
+        by_surface = np.bincount(mesh.element_surface, mesh.element_area)
+        wanted = np.bincount(geometry.polygon_surface, geometry.polygon_area)
+        assert np.allclose(by_surface, wanted, rtol=1e-12)
+        # Each piece lies with its own polygon: same plane, area as its corners say.
+        flat = mesh.element_polygon >= 0
+        assert np.allclose(mesh.element_normal[flat], geometry.polygon_normal[mesh.element_polygon[flat]], atol=1e-12)
+        tree.open(np.sort(rng.choice(leaves, max(1, len(leaves) // 3), replace=False)))
+    arrays, n = tree.arrays, tree.node_count
+    assert (arrays.parent[1:n] < np.arange(1, n)).all()
+
+
+def test_two_sided_surfaces_have_both_sides_in_the_tree():
+    scene = sheet_over_floor(0.4, two_sided=True)
+    geometry = Geometry.from_scene(scene)
+    tree = Hierarchy(scene, geometry)
+    mesh = tree.mesh(tree.leaves())
+    own = mesh.element_surface == 2
+    assert sorted(mesh.element_side[own]) == [-1, 1]
+    up = mesh.element_normal[own, 2] * mesh.element_side[own]
+    assert np.allclose(up, geometry.polygon_normal[2, 2])
+    # The corners run the way the normal says.
+    for e in np.flatnonzero(own):
+        ring = mesh.corners[mesh.piece_start[e] : mesh.piece_start[e + 1]]
+        assert np.cross(ring[1] - ring[0], ring[2] - ring[1]) @ mesh.element_normal[e] > 0
+
+
+def test_small_facets_stay_clustered_until_they_are_asked_for():
+    scene = room_with_ball()
+    geometry = Geometry.from_scene(scene)
+    assert geometry.polygon_count > 500
+    assert Hierarchy(scene, geometry).leaf_count == 7
+    coarse, fine = (solve(scene, link_error=e).mesh.element_count for e in (5e-2, 2e-3))
+    assert coarse < 300 < 800 < fine
+
+
+# Solutions
+
+
+@pytest.mark.parametrize("rho", [0.5, 0.999])
+@pytest.mark.parametrize("scene", ["cube", "ball", "box"])
+def test_a_furnace_glows_alike_everywhere(rho, scene):
+    # e / (1 - rho) whatever is inside; failure modes 8.1 and 8.3.
+    paint = diffuse("paint", rho, 1.0)
+    surfaces = {"cube": unit_cube, "ball": room_with_ball, "box": lambda: standing_box(bottom=False)}[scene]
+    base = surfaces(rho, 1.0) if scene == "cube" else surfaces()
+    furnace = replace(base, surfaces=tuple(replace(s, material=paint) for s in base.surfaces))
+    solution = solve(furnace, link_error=0.01, tolerance=1e-8)
+    mesh = solution.mesh
+    lit = solution.irradiance[:, 0] > 0.0
+    if scene == "box":
+        # The floor under the box sees nothing, and what is covered in part has a mean of both.
+        lit &= np.abs(mesh.element_centroid[:, 2]) > 1e-9
+    assert mesh.element_area[lit].sum() > 0.6 * mesh.element_area.sum()
+    assert np.abs(solution.radiosity[lit, 0] * (1 - rho) - 1).max() < (1e-6 if scene != "box" else 5e-3)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_the_energy_book_balances(closed):
+    solution = solve(room_with_ball(closed=closed), link_error=0.01, tolerance=1e-8)
+    book, mesh = solution.book, solution.mesh
+    assert book.imbalance(solution.unshot_power) < 1e-12
+    assert np.allclose(book.shot, book.received + book.escaped, rtol=1e-12)
+    held = mesh.element_area @ (solution.radiosity - mesh.emission)
+    assert np.allclose(held, mesh.element_area @ (mesh.reflectance * solution.irradiance), rtol=1e-12)
+    if closed:
+        assert book.absorbed[0] == pytest.approx(book.emitted[0], rel=1e-6)
+    errors = solution.record.errors
+    assert errors["reciprocity"] == 0.0 and errors["remaining_bound"] < 1e-6
+    assert abs(errors["row_sum"]["mean"] - 1) < 0.03
+
+
+@pytest.mark.parametrize("scene", ["cube", "box"])
+def test_it_agrees_with_the_direct_solver_on_the_same_elements(scene):
+    base = cube_with_emitter(0.2, 0.7) if scene == "cube" else standing_box(bottom=False)
+    judge = radiosity.solve(base, method="direct", max_edge=0.26, workers=1, form_factor_error=1e-3)
+    solution = hierarchical.solve_hierarchical(
+        base,
+        Geometry.from_scene(base),
+        RunRecord(command="solve"),
+        max_edge=0.26,
+        min_edge=0.2,
+        link_error=2e-4,
+        form_factor_error=1e-3,
+    )
+    order, wanted = (np.lexsort(np.round(s.mesh.element_centroid, 6).T) for s in (solution, judge))
+    assert np.allclose(solution.mesh.element_centroid[order], judge.mesh.element_centroid[wanted], atol=1e-9)
+    ratio = solution.irradiance[order, 0] - judge.irradiance[wanted, 0]
+    assert np.sqrt(np.average(ratio**2, weights=judge.mesh.element_area[wanted])) < 0.01 * judge.irradiance.mean()
+
+
+def test_the_answer_does_not_depend_on_the_number_of_workers():
+    scene = room_with_ball()
+    one, three = (solve(scene, link_error=5e-3, workers=w) for w in (1, 3))
+    assert np.array_equal(one.radiosity, three.radiosity)
+    assert np.array_equal(one.mesh.corners, three.mesh.corners)
+    assert one.record.counters["rays"] == three.record.counters["rays"] > 0
+
+
+def test_smaller_link_errors_bring_smaller_errors():
+    # rad/cube-continuous: mean radiosity of the sides, grey emitter, rho = 0.5.
+    scene = cube_with_emitter(0.5, 0.5)
+    counts = []
+    for error in (2e-2, 2e-3, 5e-4):
+        solution = solve(scene, link_error=error, tolerance=1e-6)
+        counts.append((solution.mesh.element_count, solution.record.results["links"]))
+    assert counts[0] < counts[1] < counts[2]
+    assert counts[2][1] < 40 * counts[2][0]
+
+
+@pytest.mark.parametrize("elements", [1, 40, 500])
+def test_no_more_elements_than_were_asked_for(elements):
+    solution = solve(cube_with_emitter(0.2, 0.7), elements=elements)
+    count = solution.mesh.element_count
+    assert count <= max(elements, 6)
+    assert count >= min(0.9 * elements, 6 if elements == 1 else elements)
+
+
+def test_failure_mode_5_7_a_dip_between_agreeing_corners_is_found():
+    # A small sheet close to the floor: corners and Gauss points of the floor are all lit, the middle is not.
+    scene = sheet_over_floor(0.2, height=0.2)
+    solution = solve(scene, link_error=2e-3)
+    mesh = solution.mesh
+    middle = (mesh.element_surface == 0) & (np.abs(mesh.element_centroid[:, :2]) < 0.06).all(axis=1)
+    assert middle.sum() >= 4
+    # At the middle the sheet hides all of a lamp that is seen at a tenth of its height.
+    lamp, sheet = (
+        point_to_polygon([[0, 0, 0]], [[0, 0, 1.0]], np.array(surface.face(0)[0]))[0] for surface in scene.surfaces[1:]
+    )
+    assert sheet > lamp
+    assert solution.irradiance[middle, 0].max() < 0.3 * lamp
+
+
+@each_truth("rad/L-room/")
+def test_l_room(name):
+    # One element a surface; the L-shaped floor and ceiling are two pieces each.
+    case = truth(name)
+    scene = l_room(int(name.rpartition("-")[2]) - 1)
+    solution = solve(scene, elements=1, tolerance=1e-8, form_factor_error=1e-3)
+    assert np.abs(solution.radiosity[:, 0] - case["value"]).max() < 1e-4
+
+
+def test_leaving_direct_light_to_points_makes_fewer_elements():
+    scene = sheet_over_floor(0.5)
+    shown, gathered = (solve(scene, link_error=2e-3, direct_in_mesh=d) for d in (True, False))
+    assert 3 * gathered.mesh.element_count < shown.mesh.element_count
+    area = gathered.mesh.element_area
+    floor = gathered.mesh.element_surface == 0
+    mean = np.average(gathered.irradiance[floor, 0], weights=area[floor])
+    own = shown.mesh.element_surface == 0
+    assert mean == pytest.approx(np.average(shown.irradiance[own, 0], weights=shown.mesh.element_area[own]), rel=0.02)
+
+
+# Stopping and refusing
+
+
+def test_ctrl_c_leaves_a_usable_solution():
+    scene = room_with_ball()
+    whole = solve(scene, link_error=5e-3)
+    events = []
+
+    def stop(event):
+        events.append(event)
+        if len(events) == 12:
+            raise KeyboardInterrupt
+
+    solution = solve(scene, link_error=5e-3, progress=stop)
+    assert solution.stopped == "interrupted" and not solution.converged
+    assert np.isfinite(solution.radiosity).all() and (solution.irradiance >= 0).all()
+    assert solution.book.imbalance(solution.unshot_power) < 1e-12
+    means = [np.average(s.irradiance[:, 0], weights=s.mesh.element_area) for s in (solution, whole)]
+    assert 0.2 < means[0] / means[1] < 2.0
+
+
+def test_links_that_do_not_fit_in_memory_are_refused(monkeypatch):
+    monkeypatch.setattr(memory, "available_bytes", lambda: 100_000)
+    monkeypatch.setattr(hierarchical, "PAIR_BYTES", 10_000)
+    with pytest.raises(MemoryForecastError, match="links"):
+        hierarchical.solve_hierarchical(
+            room_with_ball(),
+            Geometry.from_scene(room_with_ball()),
+            RunRecord(command="solve"),
+            link_error=1e-3,
+        )
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"link_error": 0.0}, "link_error: found 0"),
+        ({"link_error": np.nan}, "link_error: found nan"),
+        ({"link_error": 1e-2, "method": "progressive"}, "hierarchical"),
+    ],
+)
+def test_bad_options_get_one_line(options, words):
+    with pytest.raises(OptionError, match=words):
+        solve(unit_cube(0.5, 1.0), **options)
+
+
+def test_saved_solutions_come_back_and_are_drawn(tmp_path):
+    solution = solve(room_with_ball(), link_error=2e-2)
+    solution.save(tmp_path)
+    again = radiosity.Solution.load(tmp_path)
+    assert np.array_equal(again.radiosity, solution.radiosity)
+    poly = solution.to_pyvista()
+    assert poly.n_cells == len(solution.mesh.piece_element)
+    assert radiosity.render_preview(solution, 40, 30).shape[0] == 30
