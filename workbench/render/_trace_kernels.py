@@ -482,12 +482,28 @@ def add_share(rows, surface, share, values, leaving):
 
 
 @njit(nogil=True, cache=True)
-def next_rays(rows, points, facing, side, offset, start):
-    """Origins off the surface, toward the viewer or (``side`` < 0) away from him."""
-    for place in range(rows.shape[0]):
+def next_rays(rows, points, facing, side, offset, keys, ray, sample, node, branch, branching, nodes):
+    """What follows from some hits: origins off the surface, keys, samples and tree nodes, a row each.
+
+    Origins lie toward the viewer, or (``side`` < 0) away from him.  ``branch`` is 1 for reflected
+    and 2 for refracted rays; a node beyond ``nodes`` is -1.
+    """
+    count = rows.shape[0]
+    start = np.empty((count, 3))
+    new_keys, new_sample, new_node = (
+        np.empty(count, keys.dtype),
+        np.empty(count, sample.dtype),
+        np.empty(count, node.dtype),
+    )
+    for place in range(count):
         i = rows[place]
         for c in range(3):
             start[place, c] = points[i, c] + side[place] * offset * facing[i, c]
+        new_keys[place] = _hash(keys[ray[i]], branch)
+        new_sample[place] = sample[i]
+        below = branching * node[i] + branch
+        new_node[place] = below if node[i] >= 0 and below < nodes else -1
+    return start, new_keys, new_sample, new_node
 
 
 @njit(nogil=True, cache=True)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from workbench.errors import InputError, OptionError
 from workbench.render.atomic import AtomicOptions, Guide, RayTrees
 from workbench.render.camera import PinholeRays
-from workbench.render.trace import ComponentCount, RayTally, Tracer
+from workbench.render.trace import ComponentCount, RayTally, Traced, Tracer
 
 __all__ = ["Picture", "adaptive", "aliased", "camera_rays", "supersampled"]
 
@@ -197,14 +197,42 @@ def _corners_differ(colour, place, size, columns, threshold, white):
 
 
 @njit(nogil=True, cache=True)
-def _add_squares(colour, pixel, place, size, columns, weight, total):
-    # Squares that are not cut, added to their pixels: mean of the corners times the share of area.
+def _count_or_keep(colour, pixel, place, size, columns, cut, weight, total):
+    # Squares that are not cut, added to their pixels (mean of the corners times the share of area);
+    # returns the others.
     down = size * columns
+    kept = 0
+    pixels, places = np.empty_like(pixel), np.empty_like(place)
     for i in range(place.shape[0]):
         p = place[i]
+        if cut[i]:
+            pixels[kept], places[kept] = pixel[i], p
+            kept += 1
+            continue
         for band in range(colour.shape[1]):
             four = colour[p, band] + colour[p + size, band] + colour[p + down, band] + colour[p + down + size, band]
             total[pixel[i], band] += four * weight
+    return pixels[:kept], places[:kept]
+
+
+@njit(nogil=True, cache=True)
+def _quarters(pixel, place, half, columns):
+    # The four quadrants of each square.
+    pixels, places = np.empty(4 * pixel.shape[0], pixel.dtype), np.empty(4 * pixel.shape[0], place.dtype)
+    down = half * columns
+    for i in range(pixel.shape[0]):
+        p = place[i]
+        pixels[4 * i : 4 * i + 4] = pixel[i]
+        places[4 * i], places[4 * i + 1], places[4 * i + 2], places[4 * i + 3] = p, p + half, p + down, p + down + half
+    return pixels, places
+
+
+@njit(nogil=True, cache=True)
+def _put(samples, radiance, colour, owner, saved, spared):
+    # Samples written into the lattice, and the shadow rays they spared into their pixels.
+    for i in range(samples.shape[0]):
+        colour[samples[i]] = radiance[i]
+        spared[owner[i]] += saved[i]
 
 
 @njit(nogil=True, cache=True)
@@ -290,15 +318,14 @@ class _Bands:
         self.line_known = np.zeros(self.columns, dtype=bool)
         self.line_trees: RayTrees | None = None
 
-    def _shoot(self, samples: IntArray, top: int, *how: Any) -> FloatArray:
+    def _shoot(self, samples: IntArray, top: int, *how: Any) -> Traced:
         """Trace samples of the band's lattice, numbered along its rows."""
         rays = self.rays
         along, number = _lattice_rays(samples, self.columns, top, self.step, rays.corner, rays.right, rays.down)
         found = self.tracer.trace_unchecked(rays.eye[None], along, number, *how)
         self.tally.add(found.tally)
         self.traced += len(samples)
-        self._spared = found.saved
-        return found.radiance
+        return found
 
     def sample(self, top: int, bottom: int) -> None:
         """Sample the pixel rows ``top..bottom - 1``."""
@@ -320,7 +347,8 @@ class _Bands:
             new = slice(width + 1, None)
             if trees is not None and self.line_trees is not None:
                 trees.put(slice(0, width + 1), self.line_trees)
-        self.colour[corners[new]] = self._shoot(corners[new], top, trees.rows(new) if trees is not None else None)
+        found = self._shoot(corners[new], top, trees.rows(new) if trees is not None else None)
+        self.colour[corners[new]] = found.radiance
         self.known[corners[new]] = True
 
         pixel_line, pixel_column = np.meshgrid(np.arange(bottom - top), np.arange(width), indexing="ij")
@@ -337,7 +365,7 @@ class _Bands:
             # Neighbours may have met on the boundary what the corners do not show.
             uneven = self._boundary_uneven(place[whole], step)
             if not uneven.any():
-                self._count(whole, place[whole], step)
+                self._count(whole, place[whole], step, np.zeros(len(whole), dtype=bool))
                 break
             self._descend(whole[uneven], place[whole[uneven]], step, trees, np.ones(int(uneven.sum()), dtype=bool))
             whole = whole[~uneven]
@@ -366,9 +394,10 @@ class _Bands:
         lowest = np.where(known, colour, np.inf).min(axis=1)
         return (highest - lowest).max(axis=1) > self.threshold
 
-    def _count(self, pixel: IntArray, place: IntArray, size: int) -> None:
-        """Add squares that are not cut to their pixels."""
-        _add_squares(self.colour, pixel, place, size, self.columns, 0.25 * (size / self.step) ** 2, self.total)
+    def _count(self, pixel: IntArray, place: IntArray, size: int, cut: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
+        """Add squares that are not cut to their pixels; returns pixels and places of the others."""
+        weight = 0.25 * (size / self.step) ** 2
+        return _count_or_keep(self.colour, pixel, place, size, self.columns, cut, weight, self.total)
 
     def _descend(
         self,
@@ -385,28 +414,27 @@ class _Bands:
             cut = np.zeros(len(pixel), dtype=bool)
         if keep_uncut and size > 1:
             left = pixel[~cut]
-        else:
-            self._count(pixel[~cut], place[~cut], size)
-        guide, guide_row = None, np.empty(0, dtype=np.int64)
-        if trees is not None and self.atomic is not None and cut.any():
-            guided = pixel[cut]
-            guide = Guide.from_corners(trees, self.tree_corners[guided], self.atomic)
-            guide_row = np.zeros(len(self.count), dtype=np.int64)
-            guide_row[guided] = np.arange(len(guided))
-        while cut.any():
             pixel, place = pixel[cut], place[cut]
+        else:
+            pixel, place = self._count(pixel, place, size, cut)
+        guide, guide_row = None, np.empty(0, dtype=np.int64)
+        if trees is not None and self.atomic is not None and len(pixel):
+            guide = Guide.from_corners(trees, self.tree_corners[pixel], self.atomic)
+            guide_row = np.zeros(len(self.count), dtype=np.int64)
+            guide_row[pixel] = np.arange(len(pixel))
+        while len(pixel):
             half = size // 2
             wanted, owner = _middles(pixel, place, half, self.columns, self.known, self.user, self.count)
             if len(wanted):
-                self.colour[wanted] = self._inside(wanted, owner, guide, guide_row)
-                np.add.at(self.spared, owner, self._spared)
-            quarters = place[:, None] + np.array([0, half, half * self.columns, half * self.columns + half])
-            pixel, place, size = np.repeat(pixel, 4), quarters.ravel(), half
+                found = self._inside(wanted, owner, guide, guide_row)
+                _put(wanted, found.radiance, self.colour, owner, found.saved, self.spared)
+            pixel, place = _quarters(pixel, place, half, self.columns)
+            size = half
             cut = self._uneven(place, size) if size > 1 else np.zeros(len(pixel), dtype=bool)
-            self._count(pixel[~cut], place[~cut], size)
+            pixel, place = self._count(pixel, place, size, cut)
         return left
 
-    def _inside(self, wanted: IntArray, owner: IntArray, guide: Guide | None, guide_row: IntArray) -> FloatArray:
+    def _inside(self, wanted: IntArray, owner: IntArray, guide: Guide | None, guide_row: IntArray) -> Traced:
         if guide is None:
             return self._shoot(wanted, self.top)
         place = _places(wanted, owner, self.columns, self.step, self.pixel_line, self.pixel_column)

@@ -1175,11 +1175,10 @@ class _Sweep:
     ) -> _Wave:
         """The reflected (``branch`` 1) or refracted (2) rays of some hits; ``side`` is -1 for those that go through."""
         tracer = self.tracer
-        start = np.empty((len(rows), 3))
-        kernels.next_rays(rows, found.points, found.facing, side, tracer.offset, start)
-        keys = kernels.child_keys(wave.keys[found.ray[rows]], branch, 1)
-        sample, parent = found.sample[rows], found.node[rows]
-        node = tracer.branching * parent + branch
+        start, keys, sample, node = kernels.next_rays(
+            rows, found.points, found.facing, side, tracer.offset, wave.keys, found.ray, found.sample, found.node,
+            branch, tracer.branching, self.nodes,
+        )  # fmt: skip
         if tracer.options.bundle > 1:
             exponents = tracer._materials.exponent[found.surface[rows]]
             along = kernels.lobe(along, exponents, found.facing[rows], keys, copies)
@@ -1189,7 +1188,7 @@ class _Sweep:
                 np.repeat(start, copies, axis=0), along, kernels.child_keys(keys, 3, copies),
                 np.repeat(sample, copies), np.full(len(rows) * copies, -1),
             )  # fmt: skip
-        return _Wave(start, along, keys, sample, np.where((parent >= 0) & (node < self.nodes), node, -1))
+        return _Wave(start, along, keys, sample, node)
 
     def _interpolate(self, component: str, found: _Found, rows: IntArray, leaving: FloatArray, copies: int) -> IntArray:
         """Add what may be interpolated between the corners; returns the rows that need a ray."""
