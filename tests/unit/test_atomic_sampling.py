@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from trace_scenes import floor, look_down, material, scene, square, sun
 
-from workbench.errors import OptionError
+from workbench.errors import MemoryForecastError, OptionError
 from workbench.render.adaptive import adaptive, aliased, supersampled
 from workbench.render.atomic import COMPONENTS, AtomicOptions
 from workbench.render.pictures import PICTURES, test_picture
@@ -192,3 +192,12 @@ def test_options_out_of_range_are_refused():
     blind = Tracer(dataclasses.replace(tracer.scene, camera=None))
     with pytest.raises(Exception, match="camera"):
         aliased(blind)
+
+
+def test_a_picture_that_does_not_fit_is_refused_before_it_starts(tracers, monkeypatch):
+    """64 x 48 pixels hold 16 bytes of counts and 4 copies of 3 float64 each; a band of level 8 holds far more."""
+    monkeypatch.setattr("workbench.memory.available_bytes", lambda: 64 * 48 * (16 + 96) + 10**6)
+    tracer = tracers["tori"]
+    aliased(tracer)
+    with pytest.raises(MemoryForecastError, match="lower level"):
+        adaptive(tracer, level=8)

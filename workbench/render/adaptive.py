@@ -23,11 +23,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workbench.errors import InputError, OptionError
+from workbench.memory import require_memory
 from workbench.render.atomic import AtomicOptions, Guide, RayTrees
 from workbench.render.camera import PinholeRays
 from workbench.render.trace import ComponentCount, RayTally, Traced, Tracer
 
-__all__ = ["Picture", "adaptive", "aliased", "camera_rays", "supersampled"]
+__all__ = ["Picture", "adaptive", "aliased", "camera_rays", "require_picture_memory", "supersampled"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -70,10 +71,19 @@ def camera_rays(tracer: Tracer, camera: PinholeRays | None) -> PinholeRays:
     return PinholeRays.from_camera(tracer.scene.camera)
 
 
+def require_picture_memory(rays: PinholeRays, bands: int, lattice: int) -> None:
+    """Refuse a picture that cannot be held: radiance, counts, and its copies on the way to bytes."""
+    needed = rays.width * rays.height * (16 + 4 * 8 * bands) + lattice
+    require_memory(
+        needed, f"a picture of {rays.width} x {rays.height} pixels", "ask for a smaller one or a lower level"
+    )
+
+
 def _uniform(tracer: Tracer, camera: PinholeRays | None, side: int, rows: int) -> Picture:
     """``side`` x ``side`` samples at the middles of equal parts of each pixel."""
     start = time.perf_counter()
     rays = camera_rays(tracer, camera)
+    require_picture_memory(rays, tracer.bands, 0)
     radiance = np.empty((rays.height, rays.width, tracer.bands))
     tally = RayTally([ComponentCount() for _ in range(tracer.light_count)])
     for first in range(0, rays.height, rows):
@@ -133,7 +143,7 @@ def adaptive(
     atomic: AtomicOptions | None = None,
     shared_boundary: bool = False,
     white: float = 1.0,
-    rows: int = 32,
+    rows: int | None = None,
 ) -> Picture:
     """Adaptive sampling, and with ``atomic`` atomic adaptive sampling.
 
@@ -155,8 +165,8 @@ def adaptive(
         band above count, and those of the same band; so the height of the band has a small say.
     white : float
         Radiance shown as white; the thresholds, ``atomic.similar`` too, are shares of it.
-    rows : int
-        Rows of pixels a band.
+    rows : int, optional
+        Rows of pixels a band; at high levels fewer by default, for a band holds all that may be sampled.
 
     Raises
     ------
@@ -167,6 +177,9 @@ def adaptive(
     """
     if not 1 <= level <= 8:
         raise OptionError(f"level: found {level}, expected 1 to 8")
+    step = 2 ** (level - 1)
+    if rows is None:
+        rows = max(1, min(32, 128 // step))
     if rows < 1:
         raise OptionError(f"rows: found {rows}, expected 1 or more")
     if not 0.0 < white < math.inf:
@@ -175,7 +188,9 @@ def adaptive(
         atomic = replace(atomic, similar=atomic.similar * white)
     start = time.perf_counter()
     rays = camera_rays(tracer, camera)
-    band = _Bands(tracer, rays, threshold * white, white, 2 ** (level - 1), atomic, shared_boundary)
+    lattice = (rows * step + 1) * (rays.width * step + 1) * (8 * tracer.bands + 5)
+    require_picture_memory(rays, tracer.bands, lattice)
+    band = _Bands(tracer, rays, threshold * white, white, step, atomic, shared_boundary)
     for first in range(0, rays.height, rows):
         band.sample(first, min(first + rows, rays.height))
     return Picture(band.radiance, band.samples, band.saved, band.tally, band.traced, time.perf_counter() - start)

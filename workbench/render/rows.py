@@ -23,7 +23,7 @@ from workbench.accel.base import NO_POLYGON, Hits
 from workbench.accel.voxel_grid import CLOSEST, COUNTED, RayIDs, VoxelGrid, walk
 from workbench.counters import Counters
 from workbench.errors import InputError, OptionError
-from workbench.render.adaptive import Picture, camera_rays
+from workbench.render.adaptive import Picture, camera_rays, require_picture_memory
 from workbench.render.camera import PinholeRays
 from workbench.render.trace import Tracer
 from workbench.shadow.woo import MARGIN
@@ -157,6 +157,7 @@ def picture_by_rows(
     if rows < 1:
         raise OptionError(f"rows: found {rows}, expected 1 or more")
     rays = camera_rays(tracer, camera)
+    require_picture_memory(rays, tracer.bands, 0)
     start = time.perf_counter()
     grid = grid or VoxelGrid(tracer.geometry)
     if grid.object_count != tracer.geometry.piece_count:

@@ -73,7 +73,8 @@ class TraceOptions:
         Shadow rays to a linear or area light, as in the papers; unless given, soft shadows are found
         by :class:`~workbench.shadow.occlusion.Shader`.
     shadow_error : float
-        Wanted error of soft shadows, relative to the mean irradiance of the points shaded together.
+        Wanted error of soft shadows at a sample, relative to the mean irradiance of the points
+        shaded together; a pixel averages four samples or more.
     jitter : bool
         With ``light_samples``: move the samples of a light by a random number a point.  Off,
         penumbras show steps of 1/K; on, noise, which adaptive sampling takes for detail.
@@ -93,7 +94,7 @@ class TraceOptions:
 
     depth: int = 3
     light_samples: int | None = None
-    shadow_error: float = 0.01
+    shadow_error: float = 0.02
     jitter: bool = False
     bundle: int = 1
     falloff: bool = True
@@ -495,7 +496,7 @@ class Tracer:
             for light, own in zip(self._lights, parts, strict=True)
         ]
         if any(light.senders for light in self._lights):
-            self._shader = Shader(self.geometry, workers=1)
+            self._shader = Shader(self.geometry, self.workers)
 
     def _set_up_shadows(self) -> None:
         clear: NDArray[np.bool_] = self._materials.clear
@@ -668,7 +669,8 @@ class Tracer:
     def _in_blocks(self, count: int, work: Callable[[slice], _Work]) -> list[_Work]:
         """``work`` on each block of ``count`` rays, over the threads; always one block or more."""
         blocks = [slice(i, min(i + BLOCK_RAYS, count)) for i in range(0, max(count, 1), BLOCK_RAYS)]
-        if self.workers > 1 and len(blocks) > 1:
+        # The shadow module has threads of its own.
+        if self.workers > 1 and len(blocks) > 1 and self._shader is None:
             with ThreadPoolExecutor(self.workers) as pool:
                 return list(pool.map(work, blocks))
         return [work(rows) for rows in blocks]
