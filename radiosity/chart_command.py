@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["chart"]
 
-WHAT = ("shadows", "viewfactors", "solve", "render")
+WHAT = ("shadows", "viewfactors", "solve", "render", "picture")
 LIMIT = 5.0
 """Seconds of a run after which finer settings of its technique are left out, unless asked otherwise."""
 
@@ -56,7 +56,7 @@ LIMIT = 5.0
 @click.option("--grid", metavar="NxM", help="shadows: points on the surface.  [default: 48x48]")
 @click.option("--surface", metavar="NAME", help="shadows: that surface.  [default: the largest that faces up]")
 @click.option("--points", type=click.IntRange(2, 1 << 20), metavar="N", help="solve: points.  [default: 256]")
-@click.option("--width", type=click.IntRange(4, 4096), metavar="PIXELS", help="render: across.  [default: 96]")
+@click.option("--width", type=click.IntRange(4, 4096), metavar="PIXELS", help="render, picture: across.  [default: 96]")
 @click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Threads.  [default: all cores]")
 @click.option("-o", "--output", "directory", type=click.Path(path_type=Path), required=True, metavar="DIR")
 def chart(
@@ -85,11 +85,12 @@ def chart(
     viewfactors  form factors between all polygons
     solve        light at points on all surfaces after all reflections
     render       a picture of the direct light
+    picture      a picture of all the light
 
     DIR gets records.csv (a row a run), chart.svg, chart.png, report.html and record.json.  Runs that
     DIR already holds are not run again: an interrupted chart goes on, and new techniques or settings
     join an old record.  Rivals (mitsuba, radiance, pyviewfactor, trimesh) are left out with a reason
-    where they are not installed.  For solve and render lamps reflect nothing, in all techniques.
+    where they are not installed.  Lamps reflect nothing, in all techniques.
     """
     from radiosity.shadow_command import _check_folder
 
@@ -103,7 +104,9 @@ def chart(
         click.echo(f"note: {note}", err=True)
     options: dict[str, Any] = {"workers": workers}
     given = {"grid": grid, "surface": surface, "points": points, "width": width}
-    belongs = {"shadows": ("grid", "surface"), "solve": ("points",), "render": ("width",)}.get(what, ())
+    belongs = {"shadows": ("grid", "surface"), "solve": ("points",), "render": ("width",), "picture": ("width",)}.get(
+        what, ()
+    )
     for name, value in given.items():
         if value is not None:
             if name not in belongs:

@@ -295,7 +295,7 @@ class ViewFactors(Problem):
 
     what, question, default_reference = "viewfactors", "view factors", "exact"
     error_label = "error: rms over the pairs / mean form factor"
-    own = ("bundle", "hemicube", "rays")
+    own = ("auto", "bundle", "hemicube", "rays")
 
     @property
     def title(self) -> str:
@@ -323,6 +323,23 @@ class ViewFactors(Problem):
         # Element i of the mesh is some polygon; hand the matrix back in the scene's order.
         order = np.argsort(self._mesh.element_polygon)
         return np.ascontiguousarray(factor[np.ix_(order, order)]), counters
+
+    def _auto(self) -> Technique:
+        from radiosity.form_factors.matrix import view_factors
+
+        order = np.argsort(self._mesh.element_polygon)
+
+        def ask(value: float, seed: int) -> Answer:
+            found = view_factors(self.scene, error=value, workers=self.workers, seed=seed)
+            stated = found.standard_error
+            doubt = stated if isinstance(stated, np.ndarray) else stated.toarray()
+            mean = float(found.dense().mean())
+            return Answer(
+                found.dense()[np.ix_(order, order)], dict(found.record.counters),
+                float(np.sqrt((doubt**2).mean())) / mean if mean > 0 else None,
+            )  # fmt: skip
+
+        return Technique("auto", "error", (0.1, 0.03, 0.01, 0.003, 0.001), ask, kind="auto")
 
     def _bundle(self) -> Technique:
         from radiosity.solvers.solve import _settings
@@ -439,9 +456,11 @@ class Solve(Problem):
 
     what, question = "solve", "irradiance"
     error_label = "error: rms over the points / mean irradiance"
-    own = ("progressive", "progressive+gather", "direct", "direct+gather")
-    gather_error = 0.3
-    """Share of the wanted error that is left to gathering."""
+    own = (
+        "auto", "progressive", "progressive+gather", "hierarchical", "hierarchical+gather", "direct", "direct+gather",
+    )  # fmt: skip
+    gather_share = 0.5
+    """``auto``: share of the wanted error that is left to gathering."""
 
     def __init__(self, scene: Scene, *, points: int = 256, workers: int | None = None) -> None:
         super().__init__(black_lamps(scene), workers=workers)
@@ -512,6 +531,23 @@ class Solve(Problem):
 
         return Technique(name, "elements", values, ask)
 
+    def _auto(self) -> Technique:
+        from radiosity.accuracy import solve
+
+        def ask(value: float, seed: int) -> Answer:
+            solution = solve(self.scene, error=value, workers=self.workers, seed=seed)
+            values, counters = self._gathered(solution, self.gather_share * value, seed)
+            stated = math.hypot(float(solution.record.errors["estimate"]["total"]), self.gather_share * value)
+            return Answer(values, counters, stated)
+
+        return Technique("auto", "error", (0.1, 0.05, 0.02), ask, kind="auto")
+
+    def _hierarchical(self) -> Technique:
+        return self._meshed("hierarchical", "hierarchical", (100, 400, 1600), False)
+
+    def _hierarchical_gather(self) -> Technique:
+        return self._meshed("hierarchical+gather", "hierarchical", (50, 200, 800), True)
+
     def _progressive(self) -> Technique:
         return self._meshed("progressive", "progressive", (100, 400, 1600), False)
 
@@ -549,7 +585,8 @@ class Pictures(Problem):
 
     what, question = "render", "picture"
     error_label = "error: rms over the pixels that see no lamp / mean radiance"
-    own = ("aliased", "adaptive", "atomic")
+    own = ("aliased", "adaptive", "atomic", "gather")
+    direct_only = True
 
     def __init__(self, scene: Scene, *, width: int = 96, workers: int | None = None) -> None:
         super().__init__(black_lamps(scene), workers=workers)
@@ -563,7 +600,7 @@ class Pictures(Problem):
     def title(self) -> str:
         """The question in words."""
         size = f"{self.camera.width} x {self.camera.height} pixels"
-        return f"direct light in {size}, {self.geometry.polygon_count:,} polygons"
+        return f"{'direct' if self.direct_only else 'all'} light in {size}, {self.geometry.polygon_count:,} polygons"
 
     @cached_property
     def white(self) -> float:
@@ -630,7 +667,7 @@ class Pictures(Problem):
 
     def _rival(self, name: str, rival: Rival) -> Technique:
         def ask(value: float, seed: int) -> Answer:
-            return Answer(rival.picture(self.camera, samples=int(value), seed=seed, direct_only=True))
+            return Answer(rival.picture(self.camera, samples=int(value), seed=seed, direct_only=self.direct_only))
 
         return Technique(name, "samples a pixel", (1, 4, 16, 64, 256), ask, kind="rival")
 
@@ -641,7 +678,42 @@ class Pictures(Problem):
         if kind == "converged":
             found = self._aliased().ask(16, 1)
             return Reference("16 x 16 samples a pixel", found.values)
-        return _rival_reference(self, kind, 4096)
+        return _rival_reference(self, kind, 1024)
+
+    def _gather(self) -> Technique:
+        def ask(value: float, seed: int) -> Answer:
+            return self._gathered(value, seed)
+
+        return Technique("gather", "error", (0.1, 0.05, 0.02), ask, kind="auto")
+
+    def _gathered(self, error: float, seed: int) -> Answer:
+        """A solve as good as the picture needs, and the final gather."""
+        from radiosity.accuracy import solve
+        from radiosity.gather import GatherOptions, PictureGatherer
+        from workbench.render.camera import PinholeRays
+
+        options: dict[str, Any] = {"elements": 16, "tolerance": 0.5} if self.direct_only else {"error": error}
+        solution = solve(self.scene, workers=self.workers, seed=seed, **options)
+        choice = GatherOptions(error=error, indirect=not self.direct_only, see_backs=True)
+        gatherer = PictureGatherer(solution, choice, workers=self.workers, seed=seed)
+        picture = gatherer.draw(PinholeRays.from_camera(self.camera))
+        counters = Counters()
+        counters.merge(solution.record.counters)
+        counters.merge(picture.counters)
+        return Answer(picture.radiance, dict(counters))
+
+
+class GlobalPictures(Pictures):
+    """A small picture of all the light, direct and reflected. [W m-2 sr-1]"""
+
+    what, direct_only = "picture", False
+    own = ("gather",)
+
+    def reference(self, kind: str) -> Reference:
+        """A final gather to 0.5 %."""
+        if kind == "converged":
+            return Reference("final gather to 0.5 %", self._gathered(0.005, 7).values, 0.0, 0.005)
+        return super().reference(kind)
 
 
 def replace_camera(problem: Pictures, camera: Any) -> Pictures:
@@ -655,7 +727,9 @@ def replace_camera(problem: Pictures, camera: Any) -> Pictures:
     return other
 
 
-PROBLEMS: dict[str, type[Problem]] = {kind.what: kind for kind in (Shadows, ViewFactors, Solve, Pictures)}
+PROBLEMS: dict[str, type[Problem]] = {
+    kind.what: kind for kind in (Shadows, ViewFactors, Solve, Pictures, GlobalPictures)
+}
 """Problems by the word that the command line has for them."""
 
 
