@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from radiosity.chart_command import chart
+from radiosity.explain_command import explain
 from radiosity.irradiance_command import irradiance
 from radiosity.render_command import render
 from radiosity.reproduce import REPRODUCTIONS
@@ -444,6 +445,7 @@ main.add_command(irradiance)
 main.add_command(chart)
 main.add_command(viewfactors)
 main.add_command(stability)
+main.add_command(explain)
 
 
 # ---- view, scenes, doctor ---------------------------------------------------------------------

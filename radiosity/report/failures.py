@@ -9,7 +9,7 @@ documentation names the case; anything else is *wrong silently*, which no techni
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -168,7 +168,7 @@ SAMPLES = 1024
 
 
 def _lit_scene(
-    lights: list[FloatArray], occluders: list[FloatArray] | list[Surface], pane: float = 0.0, floor: bool = False
+    lights: list[FloatArray], occluders: Sequence[FloatArray | Surface], pane: float = 0.0, floor: bool = False
 ) -> Scene:
     """Lights of radiance 1, black occluders (or panes of a transmittance), perhaps a floor at z = 0."""
     lamp = diffuse("lamp", 0.0, math.pi)
@@ -196,7 +196,7 @@ def _shadow(scene: Scene, method: str, point: ArrayLike) -> tuple[float, float]:
     geometry = Geometry.from_scene(scene)
     own = scene.surfaces[-1].name == "floor"
     found = estimate(
-        [point], [[0.0, 0.0, 1.0]], lights_of_scene(scene, geometry), geometry, method, error=0.002, samples=SAMPLES,
+        np.asarray(point, dtype=float)[None], [[0.0, 0.0, 1.0]], lights_of_scene(scene, geometry), geometry, method, error=0.002, samples=SAMPLES,
         seed=1, own_polygon=geometry.polygon_count - 1 if own else -1, workers=1,
     )  # fmt: skip
     return float(found.irradiance[0, 0]), float(found.standard_error[0, 0])

@@ -13,7 +13,7 @@ import math
 import resource
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "COUNTS", "Point", "Run", "auto_ratios", "draw_chart", "measure", "points_of", "read_runs", "scene_digest",
-    "write_runs",
+    "COUNTS", "Point", "Run", "auto_ratios", "counted", "draw_chart", "measure", "points_of", "read_runs",
+    "scene_digest", "write_runs",
 ]  # fmt: skip
 
 COUNTS = (
@@ -212,7 +212,8 @@ def _processor_seconds() -> float:
     return time.process_time() + children.ru_utime + children.ru_stime
 
 
-def _counted(counters: Any) -> dict[str, int]:
+def counted(counters: Mapping[str, int]) -> dict[str, int]:
+    """The counts of a record, from counters by their names."""
     counts = {name: int(counters.get(name, 0)) for name in COUNTS if name != "tests"}
     counts["tests"] = sum(int(counters.get(name, 0)) for name in _TESTS)
     return counts
@@ -313,7 +314,7 @@ def measure(
                 stated = math.nan if answer.stated is None else answer.stated
                 known[place] = Run(
                     name, technique.kind, technique.key, float(value), seed, repeat, seconds, used, prepare,
-                    memory.used, error, doubt, stated, **_counted(answer.counters),
+                    memory.used, error, doubt, stated, **counted(answer.counters),
                 )  # fmt: skip
                 report(f"{name:20s} {technique.key} {value:<8g} seed {seed}: {seconds:8.3f} s, error {error:.2e}")
                 save(list(known.values()))
@@ -446,7 +447,9 @@ def draw_chart(figure: Figure, points: Sequence[Point], *, title: str, label: st
                     color=colour,
                 )  # fmt: skip
     if floor > 0:
-        axes.axhspan(axes.get_ylim()[0], floor, color="0.93", zorder=0)
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 0.5 * floor), high)
+        axes.axhspan(min(low, 0.5 * floor), floor, color="0.93", zorder=0)
         axes.axhline(floor, color="0.5", lw=0.8, ls=":", label="error of the reference itself")
     for share in (0.1, 0.01, 0.001):
         low, high = axes.get_ylim()

@@ -585,7 +585,7 @@ class Pictures(Problem):
 
     what, question = "render", "picture"
     error_label = "error: rms over the pixels that see no lamp / mean radiance"
-    own = ("aliased", "adaptive", "atomic", "gather")
+    own: tuple[str, ...] = ("aliased", "adaptive", "atomic", "gather")
     direct_only = True
 
     def __init__(self, scene: Scene, *, width: int = 96, workers: int | None = None) -> None:
