@@ -381,7 +381,7 @@ def _factor_entries() -> list[Failure]:
 # ---- solves -----------------------------------------------------------------------------------------
 
 
-SOLVERS = ("progressive", "direct")
+SOLVERS = ("progressive", "hierarchical", "direct")
 
 
 def _solve(scene: Scene, method: str, read: Callable[[Any], float], options: dict[str, Any]) -> tuple[float, float]:
@@ -449,9 +449,10 @@ def _hit(scene: Scene, technique: str, origin: ArrayLike, direction: ArrayLike) 
     from workbench.accel.voxel_grid import VoxelGrid
 
     geometry = Geometry.from_scene(scene)
-    tracer: Any = {
+    makers: dict[str, Callable[..., Any]] = {
         "brute": BruteForce, "voxel": partial(VoxelGrid, resolution=8), "embree": EmbreeAccelerator,
-    }[technique](geometry)  # fmt: skip
+    }  # fmt: skip
+    tracer = makers[technique](geometry)
     return float(tracer.closest_hit([origin], [direction]).t[0]), 0.0
 
 

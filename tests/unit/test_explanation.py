@@ -1,0 +1,75 @@
+"""The cost model and the explanation of a solve, on numbers that are known and on one small room."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.figure import Figure
+
+from radiosity.cli import main
+from radiosity.report.cost_model import TABLE, CostModel, fit, read_table, write_table
+from radiosity.report.explanation import draw_ablations, explain
+from radiosity.report.speed_accuracy import Run
+from workbench.errors import InputError
+from workbench.scene.load import load
+
+
+def made_up(rays, cuts, seconds, kind="ours"):
+    return Run("m", kind, "k", 1.0, 0, 0, seconds, seconds, 0.0, 0.0, 0.1, 0.01, 0.1, rays=rays, exact_cuts=cuts)
+
+
+def test_fit_finds_the_prices_it_was_made_of():
+    """0.01 s to start, 1e-7 s a ray, 1e-6 s a cut."""
+    rng = np.random.default_rng(1)
+    runs = [made_up(int(r), int(c), 0.01 + 1e-7 * r + 1e-6 * c) for r, c in rng.integers(0, 10**6, (12, 2))]
+    model = fit([*runs, made_up(5, 5, 99.0, "rival")])
+    assert model.start == pytest.approx(0.01, rel=1e-6)
+    assert model.seconds == {"rays": pytest.approx(1e-7), "exact_cuts": pytest.approx(1e-6)}
+    assert model.spread < 1e-9 and model.runs == 12
+    assert model.predict({"rays": 10**6, "exact_cuts": 10**5}) == pytest.approx(0.21)
+    assert list(model.parts({"rays": 1, "exact_cuts": 10**6})) == ["exact_cuts", "start", "rays"]
+
+
+def test_prices_are_never_negative():
+    runs = [made_up(n, 10**5 - n, 0.1 + 1e-7 * n) for n in (10, 20000, 40000, 80000)]
+    model = fit(runs)
+    assert model.start >= 0 and all(price > 0 for price in model.seconds.values())
+    with pytest.raises(InputError, match="3 or more"):
+        fit(runs[:2])
+
+
+def test_the_committed_table_can_be_read_and_written(tmp_path):
+    models = read_table()
+    assert {"shadows", "viewfactors", "solve"} <= set(models)
+    assert all(model.runs >= 3 and model.spread < 1.0 for model in models.values())
+    write_table(models, tmp_path / "t.json")
+    assert (tmp_path / "t.json").read_text() == TABLE.read_text()
+    (tmp_path / "t.json").write_text('{"solve": 3}')
+    with pytest.raises(InputError, match="no table"):
+        read_table(tmp_path / "t.json")
+    assert isinstance(models["solve"], CostModel)
+
+
+def test_a_solve_is_explained():
+    found = explain(load("l-room"), error=0.2, repeats=1)
+    told = "\n".join(found.facts)
+    for said in ("reached", "not subdivided", "lights", "exact cuts", "rays a point"):
+        assert said in told
+    assert {item.part for item in found.ablations} == {"mesh", "form factors", "shadows"}
+    for item in found.ablations:
+        assert item.seconds > 0 and item.seconds_without > 0 and np.isfinite(item.error_without)
+    errors = {item.without: item.error_without for item in found.ablations if item.part == "form factors"}
+    better = next(item for item in found.ablations if item.without.startswith("form factors to"))
+    assert errors[better.without] <= better.error
+    assert max(errors.values()) == errors["rays for all"] > 1e-3
+    figure = Figure(layout="constrained")
+    draw_ablations(figure, found.ablations, "t")
+    figure.savefig("/dev/null", format="png")
+    assert len(figure.axes[0].get_yticklabels()) == len(found.ablations)
+
+
+def test_bad_input_of_the_command(tmp_path):
+    for arguments in (["nothing.toml"], ["l-room", "--error", "2"]):
+        found = CliRunner().invoke(main, ["explain", *arguments])
+        assert found.exit_code == 2 and "Traceback" not in found.output
