@@ -85,7 +85,7 @@ def gather_rays(
 def collect_hits(
     origins, directions, owner, run, weight, polygon, measure, centre, scale, polygon_normal, polygon_level, through,
     root, frame, counts, cells, lists, order, boxes, links, starts, edges, piece_element, linear, law,
-    open_sky, sums, reach, seen, passed,
+    open_sky, coarse, seed, sums, reach, seen, passed, kept, kept_element, kept_polygon, near,
 ):  # fmt: skip
     """Add what the hits of rays send back to ``sums`` (points, runs, bands); the number of rays past a pane.
 
@@ -94,6 +94,9 @@ def collect_hits(
     ``law`` (irradiance for a zenith radiance of 1) and of the ground (form factor).
     ``reach`` (points, 2) gets the sum of 1 / distance and the number of hits, if ``measure``.
     ``passed`` gets the position, the weight and the distance of rays that go on through a pane.
+    A hit closer than ``coarse`` (elements,) is on an element that may be too coarse for its distance: ``near``
+    (points, runs) counts those, ``kept`` (points, runs, m, 4) has the place and weight of m of them, each
+    as likely (reservoir sampling, A. G. Waterman's), with their element and polygon (~polygon seen from behind).
     """
     many = 0
     bands = linear.shape[1]
@@ -138,6 +141,18 @@ def collect_hits(
             if piece < 0:
                 piece = search_list(x, y, z, -1 - piece, lists, order, boxes, links, starts, edges)
             e = piece_element[piece]
+        if t < coarse[e]:
+            slot = near[position, run[k]]
+            near[position, run[k]] += 1
+            if slot >= kept.shape[2]:
+                slot = np.int64(hashed(position * 65537 + k, seed) % np.uint64(slot + 1))
+            if slot < kept.shape[2]:
+                kept[position, run[k], slot, 0] = x
+                kept[position, run[k], slot, 1] = y
+                kept[position, run[k], slot, 2] = z
+                kept[position, run[k], slot, 3] = weight[k]
+                kept_element[position, run[k], slot] = e
+                kept_polygon[position, run[k], slot] = p if facing < 0.0 else ~p
         for band in range(bands):
             value = linear[e, band, 0] * x + linear[e, band, 1] * y + linear[e, band, 2] * z + linear[e, band, 3]
             sums[position, run[k], band] += weight[k] * max(value, 0.0)

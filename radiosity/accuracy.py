@@ -272,6 +272,7 @@ def _refine(
 ) -> Solution:
     """Solve finer and finer meshes until two of them agree."""
     best: Solution | None = None
+    gatherer: Gatherer | None = None
     where: tuple[FloatArray, FloatArray, IntArray] | None = None
     estimate = ErrorEstimate(math.inf, 0.0, 0.0, 0.0)
     count = max(16, round(FIRST_ELEMENTS / max(_first_error(run), LEAST_FIRST_ERROR)))
@@ -324,7 +325,9 @@ def _refine(
         if where is None:
             # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
             where = surface_points(build_mesh(scene, Geometry.from_scene(scene)), POINTS)
-        found = Gatherer(solution, workers=run.options.get("workers"), seed=1).irradiance(
+        if gatherer is None:
+            gatherer = Gatherer(solution, workers=run.options.get("workers"), seed=1)
+        found = gatherer.reading(solution).irradiance(
             where[0], where[1], own_polygon=where[2], rays=GATHER_RAYS, error=max(_first_error(run), 1e-4)
         )
         mean = float(solution.mean_irradiance.mean())

@@ -53,7 +53,18 @@ POOL = 4.0
 """Degrees of freedom for which the mean spread of all points counts in the error of one."""
 DIRECT_SHARE = 0.5
 """Share of the wanted error that sampled direct light may take."""
+COARSE = 0.5
+"""Distance, in diameters of an element, below which rays that hit it may need more than the mesh knows."""
+DEEP_HITS = 8
+"""Such hits of a run of rays whose light is gathered again, instead of read from the mesh."""
+NEAR_RAYS = 512
+"""Rays a point that find them where the rest is gathered in closed form."""
+DEEP_RAYS = 16
+"""Rays from each of them, and the error of its direct light:"""
+DEEP_ERROR = 0.05
 
+_Close = tuple[IntArray, IntArray, NDArray[np.float64], IntArray, IntArray]
+"""Rows of points, and of each and its runs: hits on coarse elements, some of these, their elements and polygons."""
 
 COSTS = {BOX: 0.04, CHECK: 0.15, CLOSED: 0.6, CUT: 7.0, PIECES: 0.9}
 """Costs by which a method is chosen, in units of a ray made, traced and read (0.15 us, measured)."""
@@ -182,6 +193,8 @@ class Gatherer:
         self.reflected = np.ascontiguousarray(solution.radiosity - np.where(asked[:, None], mesh.emission, 0.0))
         gradient = element_gradients(mesh, self.lookup, self.reflected)
         level = self.reflected - np.einsum("ebk,ek->eb", gradient, mesh.element_centroid)
+        bright = (mesh.reflectance * solution.irradiance).any(axis=1)
+        self._coarse = np.where(bright, COARSE * mesh.element_size, 0.0)
         self._sloped = gradient.any(axis=(1, 2))
         self._linear = np.ascontiguousarray(np.concatenate([gradient, level[..., None]], axis=2))
         first = self.geometry.piece_start[self.geometry.polygon_piece_start[:-1]]
@@ -336,7 +349,8 @@ class Gatherer:
             self._extend(bundle, np.arange(n), 4 * RUNS, counters)
             small = CELL_SHARE * error * (direct + bundle.result()[0]).mean(axis=0)
             value, doubt, _ = self._closed_forms(points, normals, who, np.arange(n), small, counters)
-            return value, doubt, bundle.distance(), "exact", nothing
+            fix, unsure = self._near_correction(bundle, counters)
+            return value + fix, doubt + unsure, bundle.distance(), "exact", nothing
         self._extend(bundle, np.arange(n), PILOT_RAYS, counters)
         mean, spread, from_sky = bundle.result()
         level = (direct + mean + from_sky).mean(axis=0)
@@ -350,11 +364,20 @@ class Gatherer:
             if cost / len(trial) * n < target.sum() - PILOT_RAYS * n:
                 rest = np.setdiff1d(np.arange(n), trial)
                 other = self._closed_forms(points, normals, who, rest, CELL_SHARE * error * level, counters)
-                return value + other[0], doubt + other[1], bundle.distance(), "exact", nothing
+                fix, unsure = self._near_correction(bundle, counters)
+                return value + other[0] + fix, doubt + other[1] + unsure, bundle.distance(), "exact", nothing
         for total in np.unique(target[target > PILOT_RAYS]).tolist():
             self._extend(bundle, np.flatnonzero(target == total), int(min(total, MOST_RAYS)), counters)
         mean, spread, from_sky = bundle.result()
         return mean, spread, bundle.distance(), "rays", from_sky
+
+    def _near_correction(self, bundle: _Bundle, counters: Counters) -> tuple[FloatArray, FloatArray]:
+        """What closed forms over the mesh are off by where elements are coarse for their distance, and its error."""
+        near = np.flatnonzero(bundle.close)
+        if len(near):
+            self._extend(bundle, near, NEAR_RAYS, counters)
+        mean, spread = bundle.runs_of(bundle.fix)
+        return mean, np.where(bundle.close[:, None] > 0, spread / NET_GAIN, 0.0)
 
     def _empty_bundle(self, points: FloatArray, normals: FloatArray, crowded: NDArray[np.bool_]) -> _Bundle:
         n, bands = len(points), self.reflected.shape[1]
@@ -362,11 +385,14 @@ class Gatherer:
             points,
             normals,
             np.zeros((n, RUNS, bands)),
+            np.zeros((n, RUNS, bands)),
             np.zeros((n, RUNS, 2)),
             np.zeros((n, 2)),
             np.zeros(n, dtype=np.int64),
+            np.zeros(n, dtype=np.int64),
             self.sky if crowded.any() else None,
             crowded,
+            bool(self._coarse.any()),
         )
 
     @cached_property
@@ -420,7 +446,7 @@ class Gatherer:
         before = int(bundle.count[rows[0]])
         if before:
             # The runs so far are the first rays of the longer net's first runs.
-            for sums in (bundle.sums, bundle.seen):
+            for sums in (bundle.sums, bundle.fix, bundle.seen):
                 longer = np.zeros((len(rows), *sums.shape[1:]))
                 for run in range(RUNS):
                     longer[:, run * before // count] += sums[rows, run]
@@ -437,7 +463,10 @@ class Gatherer:
         share = max(1, BLOCK_RAYS // (count - first))
         blocks = [rows[i : i + share] for i in range(0, len(rows), share)]
 
-        def work(block: IntArray) -> tuple[int, int]:
+        deep = DEEP_HITS if bundle.deep else 0
+        coarse = self._coarse if bundle.deep else np.zeros(mesh.element_count)
+
+        def work(block: IntArray) -> tuple[int, int, _Close]:
             many = len(block) * (count - first)
             origins, directions = np.empty((many, 3), np.float32), np.empty((many, 3), np.float32)
             owner, run = np.empty(many, dtype=np.int32), np.empty(many, dtype=np.int32)
@@ -448,6 +477,9 @@ class Gatherer:
             weight = np.ones(many)
             part, near = np.zeros((len(block), RUNS, bundle.sums.shape[2])), np.zeros((len(block), 2))
             seen = np.zeros((len(block), RUNS, 2))
+            kept = np.empty((len(block), RUNS, deep, 4))
+            element, side = np.zeros((len(block), RUNS, deep), np.int64), np.zeros((len(block), RUNS, deep), np.int64)
+            close = np.zeros((len(block), RUNS), np.int64)
             traced = hits = 0
             for depth in range(MOST_PANES + 1):
                 polygon = tracer.nearest_raw(origins, directions)
@@ -457,7 +489,8 @@ class Gatherer:
                     origins, directions, owner, run, weight, polygon, first == 0 and depth == 0, centre, scale,
                     geometry.polygon_normal, self._level, geometry.polygon_transmittance, self.lookup.root,
                     self.lookup.frame, self.lookup.counts, self.lookup.cells, *self.lookup.lists_and_trees,
-                    mesh.piece_element, self._linear, law, bundle.sky is not None, part, near, seen, passed,
+                    mesh.piece_element, self._linear, law, bundle.sky is not None, coarse, self.seed, part, near, seen,
+                    passed, kept, element, side, close,
                 )  # fmt: skip
                 if not through:
                     break
@@ -469,14 +502,47 @@ class Gatherer:
             bundle.sums[block] += part
             bundle.seen[block] += seen
             bundle.reach[block] += near
-            return traced, hits
+            return traced, hits, (block, close, kept, element, side)
 
         if self.workers > 1 and len(blocks) > 1:
             with ThreadPoolExecutor(self.workers) as pool:
                 done = list(pool.map(work, blocks))
         else:
             done = [work(block) for block in blocks]
-        counters.add(rays=sum(traced for traced, _ in done), rays_hit=sum(hits for _, hits in done))
+        counters.add(rays=sum(traced for traced, *_ in done), rays_hit=sum(hits for _, hits, _ in done))
+        if bundle.deep:
+            self._correct(bundle, [close for *_, close in done], counters)
+
+    def _correct(self, bundle: _Bundle, found: list[_Close], counters: Counters) -> None:
+        """Gather again where rays hit elements that are coarse for their distance.
+
+        The mesh's radiosity there is a control variate: what a few of these hits, chosen at random, really
+        send back, less what the mesh says, corrects the sum over all.
+        """
+        mesh = self.solution.mesh
+        rows = np.concatenate([block for block, *_ in found])
+        near, kept, element, side = (np.concatenate([part[i] for part in found]) for i in (1, 2, 3, 4))
+        bundle.close[rows] += near.sum(axis=1)
+        slots = np.minimum(near, DEEP_HITS)
+        point, run, slot = np.nonzero(np.arange(DEEP_HITS) < slots[..., None])
+        if not len(point):
+            return
+        place, weight = kept[point, run, slot, :3], kept[point, run, slot, 3]
+        e, polygon = element[point, run, slot], side[point, run, slot]
+        behind = polygon < 0
+        polygon = np.where(behind, ~polygon, polygon)
+        normal = self.geometry.polygon_normal[polygon] * np.where(behind, -1.0, 1.0)[:, None]
+        lit = self.direct(place, normal, own_polygon=polygon, error=DEEP_ERROR, counters=counters)
+        small = self._empty_bundle(place, normal, lit.crowded)
+        small.deep = False
+        self._extend(small, np.arange(len(place)), DEEP_RAYS, counters)
+        indirect, _, from_sky = small.result()
+        # What the mesh holds beside reflected light stays: the emission of lamps with too many facets.
+        own = self.reflected[e] - mesh.reflectance[e] * self.solution.irradiance[e]
+        true = mesh.reflectance[e] * (lit.irradiance + indirect + from_sky) + own
+        read = np.einsum("nbk,nk->nb", self._linear[e, :, :3], place) + self._linear[e, :, 3]
+        share = weight * near[point, run] / slots[point, run]
+        np.add.at(bundle.fix, (rows[point], run), share[:, None] * (true - np.maximum(read, 0.0)))
 
 
 def _power_of_two(count: int) -> int:
@@ -490,32 +556,43 @@ class _Bundle:
     points: FloatArray
     normals: FloatArray
     sums: FloatArray
+    fix: FloatArray
     seen: FloatArray
     reach: FloatArray
     count: IntArray
+    close: IntArray
     sky: SkyLight | None
     crowded: NDArray[np.bool_]
+    deep: bool
 
     def result(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean of each bundle, the standard error from the spread of the runs, and the sky seen where it is asked.
 
         Four runs tell an error but roughly, so each point's counts together with the mean of all.
         """
-        count = self.count[:, None]
-        mean = self.sums.sum(axis=1) / count
-        each = self.sums * (RUNS / count[..., None])
-        from_sky = np.zeros_like(mean)
+        from_sky = np.zeros((len(self.points), self.sums.shape[2]))
+        parts = None
         if self.sky is not None:
-            seen = self.seen * (RUNS * self.crowded[:, None, None] / count[..., None])
+            seen = self.seen * (RUNS * self.crowded[:, None, None] / self.count[:, None, None])
             parts = np.stack([self.sky.irradiance(seen[:, run]) for run in range(RUNS)], axis=1)
             from_sky = parts.mean(axis=1)
-            each = each + parts
+        mean, spread = self.runs_of(self.sums, parts)
+        fix, unsure = self.runs_of(self.fix)
+        # What corrects a sum is drawn at random: it has no net's gain.
+        return mean + fix, np.hypot(spread, unsure / NET_GAIN), from_sky
+
+    def runs_of(self, sums: FloatArray, beside: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Mean of sums (n, runs, bands) over the rays, and its standard error with ``beside``, means of the runs."""
+        count = self.count[:, None]
+        mean = sums.sum(axis=1) / count
+        each = sums * (RUNS / count[..., None])
+        if beside is not None:
+            each = each + beside
         square = ((each - each.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) / (RUNS * (RUNS - 1.0))
         # Points with other numbers of rays differ: what they share is the spread at one ray's count.
         common = count**1.5
         pooled = (square * common).mean(axis=0) / common
-        spread = NET_GAIN * np.sqrt((POOL * pooled + (RUNS - 1.0) * square) / (POOL + RUNS - 1.0))
-        return mean, spread, from_sky
+        return mean, NET_GAIN * np.sqrt((POOL * pooled + (RUNS - 1.0) * square) / (POOL + RUNS - 1.0))
 
     def distance(self) -> FloatArray:
         """Harmonic mean distance of the hits, infinite where nothing was met."""

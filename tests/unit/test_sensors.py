@@ -167,3 +167,22 @@ def test_bad_questions_are_refused(cornell):
         gatherer.irradiance([[0, 0, 0]], [[0, 0, 1]], error=0)
     with pytest.raises(OptionError, match="rays: found 0"):
         gatherer.irradiance([[0, 0, 0]], [[0, 0, 1]], rays=0)
+
+
+def test_hits_on_elements_that_are_coarse_for_their_distance_are_gathered_again():
+    # Along the edges of the cube a ray's hit lies on an element far larger than its distance; there the mean of
+    # the element says little.  Truth: the same cube, each element a 64th of the area.
+    scene = cube_with_emitter(0.5, 0.5)
+    coarse, fine = (radiosity.solve(scene, elements=n, form_factor_error=1e-3) for n in (24, 1536))
+    d = np.linspace(0.01, 0.1, 12)
+    points = np.column_stack([d, np.full(12, 0.37), np.ones(12)])
+    normal = [[0, 0, -1.0]]
+    wanted = Gatherer(fine).irradiance(points, normal, rays=4096).irradiance[:, 0]
+    gatherer = Gatherer(coarse)
+    found = gatherer.irradiance(points, normal, rays=4096)
+    off = np.sqrt((((found.irradiance[:, 0] - wanted) / wanted) ** 2).mean())
+    gatherer._coarse[:] = 0.0
+    read = gatherer.irradiance(points, normal, rays=4096)
+    plain = np.sqrt((((read.irradiance[:, 0] - wanted) / wanted) ** 2).mean())
+    assert off < 0.5 * plain and off < 0.02
+    assert found.counters["rays"] > read.counters["rays"]
