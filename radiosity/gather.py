@@ -51,10 +51,14 @@ APART = 1e6
 """Distance between sheets in the tree of nodes. [pixels]"""
 STEP = 0.1
 """Relative step of direct light to a neighbouring pixel, or inside one, from which it is sampled inside."""
-DIRECT_PLACES = 16
-"""Places in a subdivided pixel at which direct light is found."""
+DIRECT_SHARE = 4
+"""Of so many rays in a subdivided pixel one is a place at which direct light is found."""
 SPACING = 0.5
 """Nodes stand no further apart than this share of the harmonic mean distance to what lights them."""
+PILOT_RAYS = 128
+"""Rays of a bundle before it is known how many are needed."""
+NODE_ERROR = 1.5
+"""Standard error of a node, as a share of the picture's error: a fit averages over a few nodes."""
 NOISE = 2.5
 """Standard errors of a node by which it may differ from what was foretold without being uneven."""
 TILE = 256
@@ -75,7 +79,7 @@ class GatherOptions:
     error : float
         Wanted error: root mean square over the pixels of each one's relative error.
     rays : int, optional
-        Rays of a hemisphere bundle; as many as ``error`` needs unless given.
+        Rays of each hemisphere bundle; as many as ``error`` needs unless given.
     atomic : bool
         Interpolate indirect irradiance between nodes; otherwise every fragment is gathered.
     indirect : bool
@@ -103,14 +107,6 @@ class GatherOptions:
         return int(np.clip(round(math.log2(0.32 / self.error)), 1, 6))
 
     @property
-    def bundle(self) -> int:
-        """Rays of a hemisphere bundle."""
-        if self.rays is not None:
-            return self.rays
-        # A net's error falls as rays^-3/4; a fit averages over about NEIGHBOURS / 3 nodes.
-        return int(np.clip(2 ** round(math.log2(256 * (0.02 / self.error) ** (4 / 3))), 64, 4096))
-
-    @property
     def fuzzy_rays(self) -> int:
         """Rays of a fuzzy reflection."""
         return int(np.clip(2 ** round(math.log2(16 * 0.02 / self.error)), 4, 64))
@@ -118,7 +114,7 @@ class GatherOptions:
     @property
     def subsamples(self) -> int:
         """Rays from the eye in a pixel that shows an edge."""
-        return 16 if self.error > 0.05 else 64
+        return int(np.clip(2 ** round(math.log2(1.28 / self.error)), 16, 512))
 
 
 @dataclass
@@ -260,19 +256,27 @@ class _Nodes:
     """Where indirect irradiance was gathered.
 
     ``place`` (n, 3) is the place in the picture and the sheet, ``value`` (n, 2 bands) the irradiance
-    found, first the indirect one, then that from the sky.
+    found, first the indirect one, then that from the sky.  A ``sharp`` (n,) node on the finest lattice
+    still disagreed with its neighbours: light changes within a pixel or two, and it speaks for itself.
     """
 
     place: FloatArray
     value: FloatArray
+    sharp: NDArray[np.bool_]
 
-    def add(self, place: FloatArray, value: FloatArray) -> None:
-        self.place, self.value = np.concatenate([self.place, place]), np.concatenate([self.value, value])
+    @classmethod
+    def none(cls, bands: int) -> _Nodes:
+        return cls(np.empty((0, 3)), np.empty((0, 2 * bands)), np.empty(0, dtype=bool))
+
+    def add(self, place: FloatArray, value: FloatArray, sharp: NDArray[np.bool_]) -> None:
+        self.place = np.concatenate([self.place, place])
+        self.value = np.concatenate([self.value, value])
+        self.sharp = np.concatenate([self.sharp, sharp])
 
     def near(self, left: float, top: float, right: float, bottom: float) -> _Nodes:
         x, y = self.place[:, 0], self.place[:, 1]
         inside = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
-        return _Nodes(self.place[inside], self.value[inside])
+        return _Nodes(self.place[inside], self.value[inside], self.sharp[inside])
 
     def between(self, places: FloatArray, workers: int) -> FloatArray:
         """Irradiance at places, from the nodes of their sheets; NaN where a sheet has none."""
@@ -285,6 +289,9 @@ class _Nodes:
             np.ascontiguousarray(places[:, :2]), neighbour.reshape(shape), distance.reshape(shape), 0.5 * APART,
             np.ascontiguousarray(self.place[:, :2]), self.value, out,
         )  # fmt: skip
+        nearest = neighbour.reshape(shape)[:, 0]
+        own = self.sharp[nearest] & (distance.reshape(shape)[:, 0] < 1e-6)
+        out[own] = self.value[nearest[own]]
         return out
 
 
@@ -326,7 +333,7 @@ class Picture:
         self.drafted: set[int] = set()
         self.finished: set[int] = set()
         self.counters = Counters()
-        self._nodes = _Nodes(np.empty((0, 3)), np.empty((0, 2 * bands)))
+        self._nodes = _Nodes.none(bands)
 
     def steps(self) -> Iterator[float]:
         """Draw; yields after each tile how much is done, 0..1, and may be left at any time."""
@@ -381,11 +388,15 @@ class Picture:
     def state(self) -> dict[str, NDArray]:
         """All that :meth:`resume` needs."""
         return {
-            "radiance": self.radiance, "states": self.states, "node_place": self._nodes.place,
-            "node_value": self._nodes.value, "finished": np.array(sorted(self.finished), dtype=np.int64),
+            "radiance": self.radiance,
+            "states": self.states,
+            "node_place": self._nodes.place,
+            "node_value": self._nodes.value,
+            "node_sharp": self._nodes.sharp,
+            "finished": np.array(sorted(self.finished), dtype=np.int64),
             "drafted": np.array(sorted(self.drafted), dtype=np.int64),
             **{f"samples_{name}": count for name, count in self.samples.items()},
-        }  # fmt: skip
+        }
 
     def resume(self, state: Mapping[str, NDArray]) -> None:
         """Go on from a saved :meth:`state` of the same picture.
@@ -402,7 +413,7 @@ class Picture:
             )
         self.radiance, self.states = state["radiance"].copy(), state["states"].copy()
         self.samples = {name: state[f"samples_{name}"].copy() for name in self.samples}
-        self._nodes = _Nodes(state["node_place"], state["node_value"])
+        self._nodes = _Nodes(state["node_place"], state["node_value"], state["node_sharp"])
         self.finished, self.drafted = set(state["finished"].tolist()), set(state["drafted"].tolist())
 
 
@@ -536,7 +547,7 @@ class _Tile:
         fragments.gain = np.column_stack([np.bincount(group, band) / many for band in gain.T])
         # Direct light at some places of each fragment, for shadows have edges inside pixels, too:
         # weighted by gain, which differs where one sheet holds several surfaces.
-        chosen = seen.ray[order] % many < DIRECT_PLACES
+        chosen = seen.ray[order] % many < many // DIRECT_SHARE
         had = np.bincount(group, chosen) > 0
         chosen[start[~had]] = True
         straight = self._direct(every.take(order[chosen]))
@@ -577,9 +588,15 @@ class _Tile:
 
     def _bundles(self, fragments: _Fragments, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """What nodes hold (n, 2 bands), its standard error, and harmonic mean distance (n,) of some fragments."""
-        found = self.owner.gatherer.indirect(
-            fragments.points[rows], fragments.normals[rows], rays=self.options.bundle, counters=self.counters
-        )
+        rays, where = self.options.rays, (fragments.points[rows], fragments.normals[rows])
+        gatherer = self.owner.gatherer
+        if rays is not None:
+            found = gatherer.indirect(*where, rays=rays, counters=self.counters)
+        else:
+            found = gatherer.indirect(
+                *where, rays=PILOT_RAYS, counters=self.counters, error=NODE_ERROR * self.options.error,
+                direct=self.light.direct[rows],
+            )  # fmt: skip
         spread = np.concatenate([found.standard_error, found.standard_error], axis=1)
         return np.concatenate([found.indirect, found.sky], axis=1), spread, found.distance
 
@@ -592,7 +609,7 @@ class _Tile:
         if not self.options.atomic:
             value, _, _ = self._bundles(fragments, np.arange(len(fragments)))
             self.samples["indirect"] += np.bincount(fragments.pixel, minlength=len(self.samples["indirect"]))
-            nodes.add(everywhere, value)
+            nodes.add(everywhere, value, np.ones(len(value), dtype=bool))
             return
         margin = 2.0 * self.pitch
         edges = self.left - margin, self.top - margin, self.left + self.width + margin, self.top + self.height + margin
@@ -603,21 +620,20 @@ class _Tile:
             near = nodes.near(*edges)
             held = np.isin(cell, _cells(near.place, pitch))
             rows = _nearest_to_middles(fragments, np.flatnonzero(region & ~held), cell, pitch)
+            flagged = np.zeros(0, dtype=np.int64)
             if len(rows):
                 foretold = near.between(everywhere[rows], self.owner.workers)
                 found, spread, distance = self._bundles(fragments, rows)
-                nodes.add(everywhere[rows], found)
+                whole = direct[rows] + found[:, : self.owner.bands]
+                total = np.concatenate([whole, whole + found[:, self.owner.bands :]], axis=1)
+                off = np.abs(np.where(np.isfinite(foretold), foretold, found) - found) - NOISE * spread
+                uneven = (off > self.options.error * total).any(axis=1)
+                close = pitch * fragments.footprint[rows] > SPACING * distance
+                flagged = cell[rows[uneven | close]]
+                nodes.add(everywhere[rows], found, uneven & (pitch == 1))
                 self.samples["indirect"] += np.bincount(fragments.pixel[rows], minlength=len(self.samples["indirect"]))
             if not first:  # the second lattice is sampled everywhere, too: it judges the first
-                region = np.zeros(len(fragments), dtype=bool)
-                if len(rows):
-                    whole = direct[rows] + found[:, : self.owner.bands]
-                    total = np.concatenate([whole, whole + found[:, self.owner.bands :]], axis=1)
-                    off = np.abs(np.where(np.isfinite(foretold), foretold, found) - found) - NOISE * spread
-                    uneven = (off > self.options.error * total).any(axis=1)
-                    close = pitch * fragments.footprint[rows] > SPACING * distance
-                    flagged = cell[rows[uneven | close]]
-                    region = np.isin(cell, (np.unique(flagged)[:, None] + _AROUND).ravel())
+                region = np.isin(cell, (np.unique(flagged)[:, None] + _AROUND).ravel())
             pitch, first = pitch // 2, False
 
 

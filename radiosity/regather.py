@@ -28,7 +28,9 @@ from workbench.memory import require_memory
 __all__ = ["regathered"]
 
 STEP = 0.1
-"""Step of direct light over an element, relative to the mean irradiance, from which it is cut."""
+"""Step of direct light in an element, relative to the mean irradiance, from which it is cut."""
+INSIDE = 0.02
+"""Share of the way to the middle at which an element's corners are asked."""
 CLOSE = 1.5
 """Sizes of an element within which the harmonic mean of what lights it must not lie."""
 
@@ -107,21 +109,16 @@ def regathered(
     for number in range(passes):
         points, normals = _places(mesh, seed + number)
         bundles = found.indirect(points, normals, rays=rays, counters=solution.record.counters)
-        straight = found.direct(
-            points, normals, own_polygon=mesh.element_polygon, error=error, counters=solution.record.counters
-        )
-        direct = straight.irradiance + np.where(straight.crowded[:, None], bundles.sky, 0.0)
+        direct, uneven = _direct_light(found, mesh, points, normals, bundles.sky, error, solution)
         arriving = bundles.indirect + direct
         _fill_covered(mesh, arriving)
         found = found.reading(_holding(solution, mesh, arriving))
         if number == passes - 1:
             break
-        slope = np.linalg.norm(element_gradients(mesh, found.lookup, direct), axis=2)
-        level = np.average(arriving, axis=0, weights=mesh.element_area)
-        uneven = ((slope * mesh.element_size[:, None]) > STEP * level).any(axis=1)
+        large = mesh.element_size > smallest
         close = bundles.distance < CLOSE * mesh.element_size
         joined = np.diff(mesh.element_piece) > 1  # of several pieces: one place says little of it
-        cut = (uneven | close | joined) & (mesh.element_size > smallest) & mesh.reflectance.any(axis=1)
+        cut = (uneven | close | joined) & large & mesh.reflectance.any(axis=1)
         cut &= mesh.element_polygon >= 0
         finer, parent = _cut(mesh, cut)
         require_memory(
@@ -155,6 +152,41 @@ def _fill_covered(mesh: PatchMesh, irradiance: FloatArray) -> None:
         if len(lit):
             nearest = cKDTree(mesh.element_centroid[lit]).query(mesh.element_centroid[rows])[1]
             irradiance[rows] = irradiance[lit[nearest]]
+
+
+def _direct_light(
+    gatherer: Gatherer, mesh: PatchMesh, points: FloatArray, normals: FloatArray, sky: FloatArray, error: float,
+    solution: Solution,
+) -> tuple[FloatArray, NDArray[np.bool_]]:  # fmt: skip
+    """Mean direct irradiance (n, bands) of elements, and whether their corners differ from their places.
+
+    The mean of a flat element with k corners is 1 - k / 12 of the value at its centroid and a twelfth of
+    that at each corner: exact for quadratics on triangles and parallelograms.
+    """
+    counters = solution.record.counters
+    middle = gatherer.direct(points, normals, own_polygon=mesh.element_polygon, error=error, counters=counters)
+    value = middle.irradiance + np.where(middle.crowded[:, None], sky, 0.0)
+    uneven = np.zeros(mesh.element_count, dtype=bool)
+    sizes = np.diff(mesh.piece_start)
+    first = mesh.element_piece[:-1]
+    plain = (np.diff(mesh.element_piece) == 1) & (mesh.element_polygon >= 0) & (sizes[first] <= 4) & ~middle.crowded
+    element = np.repeat(mesh.piece_element, sizes)
+    corner = np.flatnonzero(plain[element])
+    if not len(corner):
+        return value, uneven
+    owner = element[corner]
+    # A little inside: edges of elements lie in corners of rooms.
+    place = mesh.corners[corner] + INSIDE * (mesh.element_centroid[owner] - mesh.corners[corner])
+    found = gatherer.direct(
+        place, mesh.element_normal[owner], own_polygon=mesh.element_polygon[owner], error=error, counters=counters
+    )
+    known = np.where(found.crowded[:, None], value[owner], found.irradiance)
+    level = np.average(solution.irradiance, axis=0, weights=solution.mesh.element_area)
+    differs = (np.abs(known - value[owner]) > STEP * level).any(axis=1)
+    uneven[owner[differs]] = True
+    change = known - value[owner]
+    mean = [np.bincount(owner, band / 12.0, mesh.element_count) for band in change.T]
+    return np.maximum(value + np.column_stack(mean), 0.0), uneven
 
 
 def _cut(mesh: PatchMesh, cut: NDArray[np.bool_]) -> tuple[PatchMesh, IntArray]:

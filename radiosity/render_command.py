@@ -261,7 +261,7 @@ def _render_gathered(
     options = GatherOptions(error=wanted, rays=gather_rays)
     record.settings = {
         "scene": scene_name, "solution": str(solution_path) if solution_path else None, "error": wanted,
-        "gather_rays": options.bundle, "tone": tone, "exposure": exposure, "workers": workers, "seed": seed,
+        "gather_rays": gather_rays, "tone": tone, "exposure": exposure, "workers": workers, "seed": seed,
         "camera": {"eye": camera.eye.tolist(), "look_at": camera.look_at.tolist(), "up": camera.up.tolist(),
                    "fov_deg": float(camera.fov_deg), "width": camera.width, "height": camera.height},
     }  # fmt: skip

@@ -271,7 +271,16 @@ class Gatherer:
             direct + indirect, direct, indirect, np.hypot(direct_error, doubt), distance, method, counters, seconds
         )
 
-    def indirect(self, points: FloatArray, normals: FloatArray, *, rays: int, counters: Counters) -> Bundled:
+    def indirect(
+        self,
+        points: FloatArray,
+        normals: FloatArray,
+        *,
+        rays: int,
+        counters: Counters,
+        error: float | None = None,
+        direct: FloatArray | None = None,
+    ) -> Bundled:
         """Indirect irradiance alone, for callers that find direct light elsewhere; arguments are not checked.
 
         Parameters
@@ -282,6 +291,11 @@ class Gatherer:
             Rays a point, rounded up to a power of two.
         counters : Counters
             The rays are added here.
+        error : float, optional
+            Standard error wanted at each point, relative to all the irradiance there: more rays where
+            ``rays`` are too few, up to :data:`MOST_RAYS`.
+        direct : (n, bands) float
+            With ``error``. [W m-2]
         """
         shape = (len(points), self.reflected.shape[1])
         if not self.reflected.any() and self.sky is None:
@@ -289,6 +303,13 @@ class Gatherer:
         bundle = self._empty_bundle(points, normals, np.ones(len(points), dtype=bool))
         self._extend(bundle, np.arange(len(points)), max(_power_of_two(rays), 2 * RUNS), counters)
         mean, spread, sky = bundle.result()
+        if error is not None and direct is not None:
+            allowed = error * (direct + mean + sky)
+            over = (spread / np.where(allowed > 0, allowed, math.inf)).max(axis=1)
+            target = 2 ** np.ceil(np.log2(bundle.count * np.maximum(over, 1.0) ** (4.0 / 3.0)) - 0.5)
+            for total in np.unique(target[target > bundle.count]).tolist():
+                self._extend(bundle, np.flatnonzero(target == total), int(min(total, MOST_RAYS)), counters)
+            mean, spread, sky = bundle.result()
         return Bundled(mean, spread, bundle.distance(), sky)
 
     def direct(
