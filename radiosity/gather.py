@@ -442,6 +442,7 @@ class _Tile:
         # Blocks keep their share of the picture, whatever its resolution.
         self.pitch = int(np.clip(2 ** round(math.log2(max(min(self.rays.width, self.rays.height), 1) / 16)), 4, 64))
         self.counters = Counters()
+        self.calls = 0
 
     def look(self) -> None:
         """Find what the pixels see, and its direct light."""
@@ -590,12 +591,15 @@ class _Tile:
         """What nodes hold (n, 2 bands), its standard error, and harmonic mean distance (n,) of some fragments."""
         rays, where = self.options.rays, (fragments.points[rows], fragments.normals[rows])
         gatherer = self.owner.gatherer
+        # A seed of its own for each call: rows begin at 0 in all, and alike rows would err alike.
+        self.calls += 1
+        seed = self.owner.seed + ((self.top * self.rays.width + self.left) * 64 + self.calls) * 7919
         if rays is not None:
-            found = gatherer.indirect(*where, rays=rays, counters=self.counters)
+            found = gatherer.indirect(*where, rays=rays, counters=self.counters, seed=seed)
         else:
             found = gatherer.indirect(
                 *where, rays=PILOT_RAYS, counters=self.counters, error=NODE_ERROR * self.options.error,
-                direct=self.light.direct[rows],
+                direct=self.light.direct[rows], seed=seed,
             )  # fmt: skip
         spread = np.concatenate([found.standard_error, found.standard_error], axis=1)
         return np.concatenate([found.indirect, found.sky], axis=1), spread, found.distance
@@ -630,7 +634,8 @@ class _Tile:
                 uneven = (off > self.options.error * total).any(axis=1)
                 close = pitch * fragments.footprint[rows] > SPACING * distance
                 flagged = cell[rows[uneven | close]]
-                nodes.add(everywhere[rows], found, uneven & (pitch == 1))
+                sharp: NDArray[np.bool_] = np.logical_and(uneven, pitch == 1)
+                nodes.add(everywhere[rows], found, sharp)
                 self.samples["indirect"] += np.bincount(fragments.pixel[rows], minlength=len(self.samples["indirect"]))
             if not first:  # the second lattice is sampled everywhere, too: it judges the first
                 region = np.isin(cell, (np.unique(flagged)[:, None] + _AROUND).ravel())

@@ -280,6 +280,7 @@ class Gatherer:
         counters: Counters,
         error: float | None = None,
         direct: FloatArray | None = None,
+        seed: int | None = None,
     ) -> Bundled:
         """Indirect irradiance alone, for callers that find direct light elsewhere; arguments are not checked.
 
@@ -296,7 +297,13 @@ class Gatherer:
             ``rays`` are too few, up to :data:`MOST_RAYS`.
         direct : (n, bands) float
             With ``error``. [W m-2]
+        seed : int, optional
+            Of these rays alone; that of the gatherer unless given.
         """
+        if seed is not None:
+            other = copy.copy(self)
+            other.seed = seed
+            return other.indirect(points, normals, rays=rays, counters=counters, error=error, direct=direct)
         shape = (len(points), self.reflected.shape[1])
         if not self.reflected.any() and self.sky is None:
             return Bundled(np.zeros(shape), np.zeros(shape), np.full(len(points), math.inf), np.zeros(shape))

@@ -98,7 +98,7 @@ def test_9_3_the_centre_of_a_face_is_not_its_mean():
     scene = Scene(
         "cube", (walls, Surface.from_polygons("lamp", lamp, [floor])), background=np.zeros(1), bands=1, closed=True
     )
-    gatherer = PictureGatherer(solved(scene, elements=150), GatherOptions(error=0.01), workers=1)
+    gatherer = PictureGatherer(solved(scene, elements=150), GatherOptions(error=0.01, rays=4096), workers=1)
     view = camera((0.5, 0.5, 0.5), (0.5, 0.5, 1), up=(0, 1, 0), fov=1.0, width=3, height=3)
     radiosity = gatherer.draw(view).radiance[1, 1, 0] * np.pi
     assert radiosity == pytest.approx(0.17914195, rel=0.005)
@@ -158,11 +158,12 @@ def test_a_mirror_shows_what_stands_before_it():
         background=np.zeros(1),
         bands=1,
     )
-    gatherer = PictureGatherer(solved(scene), GatherOptions(error=0.05), workers=1)
+    gatherer = PictureGatherer(solved(scene), GatherOptions(error=0.02), workers=1)
     seen = gatherer.draw(camera((1.5, 0.8, 1.0), (1.3, 1.0, 0), up=(0, 1, 0), fov=20, width=5, height=5)).radiance
     direct = gatherer.draw(camera((1.5, 0.8, -1.0), (1.3, 1.0, 0), up=(0, 1, 0), fov=20, width=5, height=5)).radiance
     assert direct.min() > 0
-    assert seen[:, ::-1] == pytest.approx(0.8 * direct, rel=3e-2)
+    off = seen[:, ::-1] / (0.8 * direct) - 1
+    assert np.sqrt((off**2).mean()) < 0.03
 
 
 def test_neither_workers_nor_tiles_matter(monkeypatch):
