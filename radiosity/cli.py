@@ -144,6 +144,13 @@ def main() -> None:
     metavar="S",
     help="Do the best that fits into S seconds and say the error reached.",
 )
+@click.option(
+    "--bundles",
+    type=click.Choice(["receiver", "directional"]),
+    default="receiver",
+    show_default=True,
+    help="Form factors from the receivers toward a patch, or by rays from the patch into its hemisphere.",
+)
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Threads.  [default: all cores]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of the rays.")
 @click.option("--json", "json_path", metavar="FILE", help="Write the run's record here too; - is standard output.")
@@ -160,6 +167,7 @@ def solve(
     error: float | None,
     budget_seconds: float | None,
     link_error: float | None,
+    bundles: str,
     workers: int | None,
     seed: int,
     json_path: str | None,
@@ -201,6 +209,7 @@ def solve(
             "tolerance": tolerance,
             "error": error,
             "budget_seconds": budget_seconds,
+            "bundles": bundles,
             "seed": seed,
         }
         previous = None

@@ -51,6 +51,7 @@ MEANINGS: dict[str, str] = {
     "reflection_rays_saved": "reflected rays replaced by interpolation between a pixel's corners",
     "refraction_rays_saved": "refracted rays replaced by interpolation between a pixel's corners",
     "shots": "patches shot",
+    "bundles": "directional bundles of rays shot from patches",
     "links": "sender-receiver pairs given a form factor",
 }
 """Every counter's name and what it counts."""

@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -43,7 +44,7 @@ from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
 from workbench.geometry.planes import newell_normal
 
-__all__ = ["Columns", "LinkSettings", "ReceiverBundles"]
+__all__ = ["ColumnFinder", "Columns", "LinkSettings", "ReceiverBundles"]
 
 FloatArray = NDArray[np.float64]
 
@@ -89,6 +90,28 @@ class LinkSettings:
             raise OptionError(f"error: found {self.error}, expected a positive number")
         if not 0 <= self.levels <= 24:
             raise OptionError(f"levels: found {self.levels}, expected 0 to 24")
+
+
+class ColumnFinder(Protocol):
+    """What a solver asks of its bundles, whichever way they are shot."""
+
+    mesh: PatchMesh
+    settings: LinkSettings
+    counters: Counters
+    seconds_in_embree: float
+    accelerator: EmbreeAccelerator
+
+    def columns(self, patches: Sequence[int] | NDArray[np.int64], floors: FloatArray | None = None) -> Columns:
+        """Form factors from all elements to each of ``patches``."""
+        ...
+
+    def take_counters(self) -> Counters:
+        """The counts since this was last asked."""
+        ...
+
+    def close(self) -> None:
+        """Stop the threads."""
+        ...
 
 
 @dataclass(frozen=True)

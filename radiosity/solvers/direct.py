@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from radiosity.form_factors.bundle import ReceiverBundles
+from radiosity.form_factors.bundle import ColumnFinder
 from radiosity.solvers.solution import Progress, ProgressEvent, Solution
 
 __all__ = ["balance_rows", "solve_direct"]
@@ -50,9 +50,7 @@ def balance_rows(exchange: FloatArray, areas: FloatArray, rounds: int = 200) -> 
     return exchange * x * x[:, None]
 
 
-def solve_direct(
-    solution: Solution, bundles: ReceiverBundles, *, closed: bool, progress: Progress | None = None
-) -> None:
+def solve_direct(solution: Solution, bundles: ColumnFinder, *, closed: bool, progress: Progress | None = None) -> None:
     """Solve ``B = E + rho F B`` with the full matrix of form factors between elements.
 
     Every element must be its own patch.  ``F`` is made reciprocal by averaging both directions; in

@@ -21,7 +21,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from radiosity.form_factors.bundle import ReceiverBundles
+from radiosity.form_factors.bundle import ColumnFinder
 from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, ShootingState, Solution
 from workbench.memory import available_bytes
 
@@ -122,7 +122,7 @@ def _floors(solution: Solution, patches: IntArray, error: float) -> FloatArray:
 
 
 def _columns(
-    solution: Solution, state: ShootingState, bundles: ReceiverBundles, patches: IntArray, room: int
+    solution: Solution, state: ShootingState, bundles: ColumnFinder, patches: IntArray, room: int
 ) -> dict[int, FloatArray]:
     """Form factors to some patches: those kept, and those found now, which are kept while there is room."""
     mesh = solution.mesh
@@ -151,7 +151,7 @@ def _columns(
 
 def shoot_until(
     solution: Solution,
-    bundles: ReceiverBundles,
+    bundles: ColumnFinder,
     *,
     tolerance: float,
     progress: Progress | None = None,
@@ -212,7 +212,7 @@ def shoot_until(
         _report(solution, bundles, state)
 
 
-def _report(solution: Solution, bundles: ReceiverBundles, state: ShootingState) -> None:
+def _report(solution: Solution, bundles: ColumnFinder, state: ShootingState) -> None:
     """Put what the run knows of its own errors into the record."""
     mesh, record = solution.mesh, solution.record
     record.counters.merge(bundles.take_counters())

@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 import math
 import os
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from radiosity.form_factors.bundle import LinkSettings, ReceiverBundles
+from radiosity.form_factors.bundle import ColumnFinder, LinkSettings, ReceiverBundles
+from radiosity.form_factors.directional import DirectionalBundles
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
 from radiosity.solvers.direct import solve_direct
 from radiosity.solvers.hierarchical import solve_hierarchical
@@ -25,6 +27,8 @@ from workbench.scene.model import Scene
 __all__ = ["solve"]
 
 METHODS = ("auto", "progressive", "direct", "hierarchical")
+BUNDLES: dict[str, Callable[..., ColumnFinder]] = {"receiver": ReceiverBundles, "directional": DirectionalBundles}
+"""How form factors are found: from the receivers toward a patch, or from the patch into its hemisphere."""
 
 DEFAULT_ELEMENTS = 2000
 DEFAULT_LINK_ERROR = 1e-3
@@ -173,6 +177,7 @@ def solve(
     form_factor_error: float | None = None,
     link_error: float | None = None,
     direct_in_mesh: bool = True,
+    bundles: str = "receiver",
     workers: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -205,6 +210,10 @@ def solve(
         their number allows, without it 1e-3.
     direct_in_mesh : bool
         Of ``hierarchical``: whether elements resolve shadows, or leave direct light to points and pictures.
+    bundles : str
+        ``receiver``: each element looks toward the shooting patch (Wallace, Elmquist and Haines 1989).
+        ``directional``: the patch shoots rays into the strata of its hemisphere (Shirley 1990); a patch then
+        shoots ``rays`` times the number of elements.
     workers : int, optional
         Threads, all cores by default.  The answer does not depend on it.
     seed : int
@@ -241,6 +250,13 @@ def solve(
             elements = DEFAULT_ELEMENTS
     elif link_error is None and elements is None:
         link_error = DEFAULT_LINK_ERROR
+    if bundles not in BUNDLES:
+        raise OptionError(f"bundles: found {bundles!r}, expected one of {', '.join(BUNDLES)}")
+    if method == "hierarchical" and bundles != "receiver":
+        raise OptionError(
+            f"bundles: found {bundles!r} with method 'hierarchical', which has links of its own;"
+            " choose method 'progressive' or 'direct'"
+        )
     _forecast(scene, elements, max_edge, method)
     settings: dict[str, Any] = {
         "scene": scene.name,
@@ -252,6 +268,7 @@ def solve(
         "form_factor_error": form_factor_error,
         "link_error": link_error,
         "direct_in_mesh": direct_in_mesh,
+        "bundles": bundles,
         "workers": count,
         "seed": seed,
     }
@@ -291,22 +308,22 @@ def solve(
     error = form_factor_error if form_factor_error is not None else _form_factor_error(n, method)
     record.choices["form_factor_error"] = f"{error:g}"
     with record.stage("prepare"):
-        bundles = ReceiverBundles(geometry, mesh, _settings(error, rays, seed, mesh.patch_count), count)
+        finder = BUNDLES[bundles](geometry, mesh, _settings(error, rays, seed, mesh.patch_count), count)
     try:
         if resume is None or method == "direct":
             # A direct solve has no half-way state to go on from.
             with record.stage("incident light"):
-                incident = incident_irradiance(scene, mesh, bundles.accelerator, seed=seed)
+                incident = incident_irradiance(scene, mesh, finder.accelerator, seed=seed)
             solution = _start(scene, mesh, incident, record)
-            record.counters.merge(bundles.accelerator.counters)
+            record.counters.merge(finder.accelerator.counters)
         else:
             solution = _resumed(scene, mesh, resume, record)
         if method == "direct":
-            solve_direct(solution, bundles, closed=scene.closed, progress=progress)
+            solve_direct(solution, finder, closed=scene.closed, progress=progress)
         else:
-            shoot_until(solution, bundles, tolerance=tolerance, progress=progress, checkpoint=checkpoint)
+            shoot_until(solution, finder, tolerance=tolerance, progress=progress, checkpoint=checkpoint)
     finally:
-        bundles.close()
+        finder.close()
     record.errors["facet_error"] = mesh.facet_error
     record.results.update(
         elements=n, patches=mesh.patch_count, energy_book=solution.book.as_dict(), stopped=solution.stopped
