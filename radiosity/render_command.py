@@ -146,8 +146,8 @@ _GATHER_ONLY = ("solution_path", "error", "quick", "gather_rays", "show_samples"
 @click.option("--level", type=click.IntRange(1, 8), default=3, show_default=True, help="Of subdivision; 3: 25 samples.")
 @click.option("--depth", type=click.IntRange(0, 16), default=3, show_default=True, help="Reflections in a row.")
 @click.option(
-    "--shadow-error", type=click.FloatRange(0, 1, min_open=True, max_open=True), callback=_finite, default=0.01,
-    show_default=True, metavar="E", help="Wanted error of soft shadows, relative to the mean irradiance.",
+    "--shadow-error", type=click.FloatRange(0, 1, min_open=True, max_open=True), callback=_finite, default=0.02,
+    show_default=True, metavar="E", help="Wanted error of a light's visible share, at a sample.",
 )  # fmt: skip
 @click.option(
     "--light-samples", type=click.IntRange(1, 4096), metavar="K",

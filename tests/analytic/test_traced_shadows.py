@@ -179,3 +179,16 @@ def test_assumed_states_give_the_same_light_without_asking():
     assert saved > 0 and saved + shot == plain.tally.shadow.shot
     # Penumbra below the edge: |x| < 0.5 at these heights; columns 3..12 lie inside it.
     assert (atomic.saved[:, 4:12] == 0).all()
+
+
+def test_shadow_error_bounds_the_visible_share_below_many_facets():
+    """A ball of 5,000 facets over the floor: root mean square error of the share, against 65,536 rays a point."""
+    ball = sphere_surface("ball", material("ball"), [0.1, 0.05, 1.0], 0.3, facet_error=0.002)
+    x, y = np.random.default_rng(4).uniform(-0.8, 0.8, (2, 300))
+    parts = SQUARE, ball
+    shares = {
+        error: received(x, *parts, y=y, shadow_error=error) / received(x, SQUARE, y=y) for error in (0.1, 0.02, 2e-4)
+    }
+    for error in (0.1, 0.02):
+        off = shares[error] - shares[2e-4]
+        assert 0 < np.sqrt((off**2).mean()) < error

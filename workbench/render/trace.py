@@ -41,6 +41,7 @@ from workbench.render.textures import Texture
 from workbench.scene.model import Light, Scene, Surface
 from workbench.shadow.lights import LinearLight, Sender, lights_of_scene
 from workbench.shadow.occlusion import OcclusionEstimate, OcclusionState, Shader
+from workbench.shadow.rays import NOISE
 
 __all__ = ["ComponentCount", "DiffuseEnds", "RayTally", "TraceOptions", "Traced", "Tracer"]
 
@@ -73,8 +74,8 @@ class TraceOptions:
         Shadow rays to a linear or area light, as in the papers; unless given, soft shadows are found
         by :class:`~workbench.shadow.occlusion.Shader`.
     shadow_error : float
-        Wanted error of soft shadows at a sample, relative to the mean irradiance of the points
-        shaded together; a pixel averages four samples or more.
+        Wanted error of the visible share of a light at a sample, where occluders are too many to be
+        cut exactly; a pixel averages four samples or more.
     jitter : bool
         With ``light_samples``: move the samples of a light by a random number a point.  Off,
         penumbras show steps of 1/K; on, noise, which adaptive sampling takes for detail.
@@ -1074,9 +1075,11 @@ class _Sweep:
         asked = np.flatnonzero(at.lit & (assumed == COMPLEX_SHADOW))
         if len(asked):
             assert tracer._shader is not None
+            # Not "auto": its smooth fits are for receivers side by side on a plane, these lie scattered.
             estimate = tracer._shader.estimate(
-                found.points[asked], found.shading[asked], light.senders, error=tracer.options.shadow_error,
-                samples=LIGHT_RAYS, seed=tracer.options.seed, own_polygon=found.polygon[asked],
+                found.points[asked], found.shading[asked], light.senders, "shaft",
+                samples=math.ceil((NOISE / tracer.options.shadow_error) ** (4.0 / 3.0)),
+                seed=tracer.options.seed, own_polygon=found.polygon[asked],
             )  # fmt: skip
             received[asked] = estimate.irradiance
             states[asked] = _joined(estimate)
