@@ -196,8 +196,8 @@ def _shadow(scene: Scene, method: str, point: ArrayLike) -> tuple[float, float]:
     geometry = Geometry.from_scene(scene)
     own = scene.surfaces[-1].name == "floor"
     found = estimate(
-        np.asarray(point, dtype=float)[None], [[0.0, 0.0, 1.0]], lights_of_scene(scene, geometry), geometry, method, error=0.002, samples=SAMPLES,
-        seed=1, own_polygon=geometry.polygon_count - 1 if own else -1, workers=1,
+        np.asarray(point, dtype=float)[None], [[0.0, 0.0, 1.0]], lights_of_scene(scene, geometry), geometry, method,
+        error=0.002, samples=SAMPLES, seed=1, own_polygon=geometry.polygon_count - 1 if own else -1, workers=1,
     )  # fmt: skip
     return float(found.irradiance[0, 0]), float(found.standard_error[0, 0])
 

@@ -46,6 +46,8 @@ class Rival:
                 raise OptionError(f"{self.name}: surface {surface.name!r} is a pane, which this rival is not given")
             if surface.material.two_sided and surface.material.emission.any():
                 raise OptionError(f"{self.name}: surface {surface.name!r} emits on both sides, expected one-sided")
+        if scene.sky is not None:
+            raise OptionError(f"{self.name}: found a sky of kind {scene.sky.kind!r}, expected a background or none")
         for light in scene.lights:
             if light.power.any() and light.kind not in self.light_kinds:
                 raise OptionError(f"{self.name}: light {light.name!r} is of kind {light.kind}, which it does not have")

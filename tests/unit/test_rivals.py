@@ -13,7 +13,7 @@ from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
 from workbench.scene.library import box_surface, diffuse, quad_light_over_floor, unit_cube
 from workbench.scene.load import load
-from workbench.scene.model import Camera, Light, Surface
+from workbench.scene.model import Camera, Light, Sky, Surface
 
 BELOW_LIGHT = 0.23083679773
 """Irradiance below the middle of a unit square light of radiance 1 at height 2 (Lambert's formula)."""
@@ -180,6 +180,8 @@ def test_what_a_rival_cannot_model_is_refused():
         scene = replace(unit_cube(0.5, 1.0), surfaces=(replace(unit_cube(0.5, 1.0).surfaces[0], material=pane),))
         with pytest.raises(OptionError, match="pane"):
             rival(name, scene)
+        with pytest.raises(OptionError, match="sky"):
+            rival(name, replace(unit_cube(0.5, 1.0), sky=Sky("overcast", np.zeros(1), zenith_radiance=np.ones(1))))
     with pytest.raises(OptionError, match="emits and reflects"):
         rival("radiance", unit_cube(0.5, 1.0))
     with pytest.raises(OptionError, match="does not answer"):
