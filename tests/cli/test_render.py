@@ -88,6 +88,7 @@ def test_a_picture_and_its_record(room, tmp_path, sampling):
     assert (record["counters"].get("plane_vertex_checks", 0) > 0) == (sampling == "rows")
     assert ("avoided by" in result.stdout) == (sampling == "rows")
     assert record["counters"]["cast_rays_hit"] > 0 and "see a surface" in result.stdout
+    assert ("widest_feature_that_can_be_missed_pixels" in record["errors"]) == (sampling in ("adaptive", "atomic"))
     assert "white" in record["choices"]
     assert str(out) in result.stdout
 

@@ -25,7 +25,7 @@ def blocked_sun(squares, pixels=8, camera=None):
     return Tracer(scene([floor(), screens], [sun()], camera or look_down(pixels, 1.0)))
 
 
-def test_small_shadow_between_lit_corners_is_missed_and_its_chance_is_known():
+def test_5_1_small_shadow_between_lit_corners_is_missed_and_its_chance_is_known():
     rng = np.random.default_rng(4)
     side, found, hidden = 0.5, [], 0
     for _ in range(40):
@@ -47,7 +47,7 @@ def test_small_shadow_between_lit_corners_is_missed_and_its_chance_is_known():
     assert hidden / 40 == pytest.approx(1 - side**2, abs=0.2)
 
 
-def test_shadow_of_one_pixel_is_always_found_and_a_finer_grid_finds_the_lost_one():
+def test_5_1_shadow_of_one_pixel_is_always_found_and_a_finer_grid_finds_the_lost_one():
     rng = np.random.default_rng(9)
     for _ in range(20):
         low = rng.uniform(-1.5, 0.4, 2)
@@ -62,7 +62,7 @@ def test_shadow_of_one_pixel_is_always_found_and_a_finer_grid_finds_the_lost_one
     assert adaptive(blocked_sun(hidden)).samples.max() == 4
 
 
-def test_lit_gap_between_dark_corners_is_missed():
+def test_5_2_lit_gap_between_dark_corners_is_missed():
     slabs = [((-9.0, -9.0), (0.4, 9.0)), ((0.6, -9.0), (9.0, 9.0))]
     pixel = np.s_[:, 4]  # x from 0 to 1
     plain = adaptive(blocked_sun(slabs), threshold=EVERYTHING, level=6)
@@ -74,7 +74,7 @@ def test_lit_gap_between_dark_corners_is_missed():
     assert finer.radiance.mean() == pytest.approx(0.2 / 8, abs=2e-3)
 
 
-def test_fold_on_one_surface_needs_the_criterion_of_normals():
+def test_5_3_fold_on_one_surface_needs_the_criterion_of_normals():
     """A groove 0.6 wide in the floor, all one surface: its wall is dark, the corners on the floor are lit."""
     edges = (-4.0, 0.2, 0.5, 0.8, 4.0)
     heights = (0.0, 0.0, -0.3, 0.0, 0.0)
@@ -103,7 +103,7 @@ def penumbra(pixels=6, samples=64):
     return Tracer(scene([floor(), lamp, half], camera=camera), TraceOptions(light_samples=samples))
 
 
-def test_no_shadow_ray_is_saved_in_a_penumbra():
+def test_5_4_no_shadow_ray_is_saved_in_a_penumbra():
     tracer = penumbra()
     plain = adaptive(tracer, threshold=EVERYTHING)
     atomic = adaptive(tracer, threshold=EVERYTHING, atomic=AtomicOptions())
@@ -112,7 +112,7 @@ def test_no_shadow_ray_is_saved_in_a_penumbra():
     np.testing.assert_array_equal(atomic.radiance, plain.radiance)
 
 
-def test_penumbra_has_the_exact_profile():
+def test_5_4_penumbra_has_the_exact_profile():
     """Irradiance at x = -0.1, 0, 0.1 behind the half-plane, the light's clipped polygon by Lambert's formula."""
     tracer = penumbra(samples=4096)
     points = np.array([[-0.1, 0.0], [0.0, 0.0], [0.1, 0.0]])
@@ -122,7 +122,7 @@ def test_penumbra_has_the_exact_profile():
     np.testing.assert_allclose(found, [0.14134448786, 0.11541839887, 0.08851031558], rtol=5e-3)
 
 
-def test_transparent_shadows_compare_values_not_flags():
+def test_5_5_transparent_shadows_compare_values_not_flags():
     """Left of x = 0 one pane of 0.5, right of it two: all corners say Complex_Shadow."""
     pane = material("pane", transmittance=0.5)
     panes = [
@@ -139,7 +139,7 @@ def test_transparent_shadows_compare_values_not_flags():
 
 
 @pytest.mark.parametrize(("samples", "error"), [(1, 0.3), (17, 1 / 16)])
-def test_linear_light_misses_gaps_between_its_samples(samples, error):
+def test_5_6_linear_light_misses_gaps_between_its_samples(samples, error):
     """An occluder that hides 0.3 of the light: the middle alone reports nothing, 17 are within 1/16."""
     hide = Surface.from_polygons("slat", material("slat"), [square((-0.2, -9.0), (-0.05, 9.0), 1.0)])
     ends = np.array([-0.5, 0.0, 2.0]), np.array([0.5, 0.0, 2.0])
@@ -155,7 +155,7 @@ def test_linear_light_misses_gaps_between_its_samples(samples, error):
         assert blocked == 0.0
 
 
-def test_dip_between_equal_corners_is_not_found_by_subdivision():
+def test_5_7_dip_between_equal_corners_is_not_found_by_subdivision():
     """Irradiance 0.0789 under a square occluder between corners that agree: one pixel sees no dip, 16 x 16 do."""
     lamp = Surface.from_polygons(
         "lamp", material("lamp", emission=np.pi, two_sided=False), [square((-0.5, -0.5), (0.5, 0.5), 2.0)[::-1]]
@@ -176,7 +176,7 @@ def test_dip_between_equal_corners_is_not_found_by_subdivision():
     assert fine.mean() < 0.9 * np.pi * picture(16, parts[:2]).radiance.mean()
 
 
-def test_error_falls_with_level_down_to_what_the_threshold_hides():
+def test_5_8_error_falls_with_level_down_to_what_the_threshold_hides():
     """A strong edge and a weak one, each through one pixel row; exact means are known."""
     rows = np.s_[:, :, 0]
 
@@ -195,7 +195,7 @@ def test_error_falls_with_level_down_to_what_the_threshold_hides():
 
 
 @pytest.mark.parametrize(("transmittance", "panes"), [(0.9, 10), (0.5, 3)])
-def test_transparent_panes_multiply(transmittance, panes):
+def test_5_9_transparent_panes_multiply(transmittance, panes):
     pane = material("pane", transmittance=transmittance)
     sheets = [
         Surface.from_polygons(f"pane {i}", pane, [square((-9.0, -9.0), (9.0, 9.0), 2.0 + 0.1 * i)])
