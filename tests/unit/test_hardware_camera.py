@@ -142,6 +142,34 @@ def test_6_2_the_mild_case_a_straight_edge():
     assert np.abs(coarse.visible_share - shifted.visible_share).max() <= 1.3 / 64 + 1e-3
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_6_9_a_corner_above_the_horizon_covers_half_of_the_viewport(backend):
+    # The cut runs along the diagonal of the pixels; through their centres it would take all of them or none.
+    empty = geometry_of(square(50, 51, 50, 51, -50))
+    for corner in range(4):
+        normal = LIGHT[corner] - LIGHT[(corner + 2) % 4]
+        for lift in (0.1, 0.2, 0.35):
+            # The tangent plane of a point in the light's axis that cuts the corner's sides alike.
+            edge = LIGHT[corner] - lift * normal
+            tilted = normal - (normal @ edge) / (edge @ edge) * edge
+            seen = look([0, 0, 0], tilted, LIGHT, empty, mode="naive", backend=backend)
+            assert seen.light_pixels[0] == 32 * 31 // 2
+            assert seen.light_weight[0] == pytest.approx(irradiance(LIGHT, normal=tilted), rel=0.01)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("jitter", ["none", "shift", "rotate"])
+def test_no_jitter_moves_the_camera_off_a_blocker_at_the_rim(backend, jitter):
+    # Seen from the origin a strip covers the outermost 1/100 of the light: no point may be known lit.
+    for turn in (LIGHT, np.roll(LIGHT, 1, axis=0)):
+        for strip in (square(-0.3, -0.245, -1, 1, 1), square(0.245, 0.3, -1, 1, 1), square(-1, 1, 0.245, 0.3, 1)):
+            seen = look(np.zeros((50, 3)), UP, turn, geometry_of(strip), jitter=jitter, seed=3, backend=backend)
+            assert (seen.state == CameraState.RENDERED).all()
+            if jitter != "none":
+                # And all of it is sampled: 1/100 on the average of the shifts.
+                assert 1 - seen.pixel_fraction.mean() == pytest.approx(0.01, abs=0.008)
+
+
 def fence(offset: float) -> Geometry:
     """32 slats at half height whose shadows are half a pixel wide, one a pixel; ``offset`` in pixels."""
     left = ((np.arange(-40, 80) + offset) / 32 - 0.5) / 2
@@ -154,7 +182,7 @@ def test_6_3_slats_one_pixel_apart_need_a_turned_pattern():
     assert look([0, 0, 0], UP, LIGHT, fence(0.75)).pixel_fraction[0] == 1.0
     points = np.zeros((400, 3))
     shifted = look(points, UP, LIGHT, fence(0.25), jitter="shift", seed=1).pixel_fraction
-    assert set(shifted) == {0.0, 1.0}
+    # A shifted pattern is a pixel wider than the light, and falls out of step by one slat over its width.
     assert shifted.mean() == pytest.approx(0.5, abs=4 * 0.5 / 20)
     turned = look(points, UP, LIGHT, fence(0.25), jitter="rotate", seed=1).pixel_fraction
     assert turned.mean() == pytest.approx(0.5, abs=0.01)
@@ -426,8 +454,10 @@ def test_both_backends_agree_but_for_pixels_on_edges(viewport):
             for backend in ("software", "gl")
         )
         assert hard.backend.startswith("gl: ")
-        assert np.array_equal(soft.state, hard.state)
         most = max(2, 0.01 * viewport**2)
+        # A sliver of a light may cover the centre of a pixel by one rounding and none by the other.
+        sliver = np.maximum(soft.light_pixels, hard.light_pixels) <= most
+        assert ((soft.state == hard.state) | sliver).all()
         assert np.abs(soft.light_pixels - hard.light_pixels).max() <= most
         assert np.abs(soft.visible_pixels - hard.visible_pixels).max() <= most
         # A pixel here and there: one of 16 is already 6 % of a picture, one of 1024 a thousandth.

@@ -69,7 +69,9 @@ class CameraShadows:
         Visible share of the irradiance above the horizon; NaN in a FALLBACK, 0 if UNLIT. [0..1]
     pixel_fraction : (m,) float
         Visible pixels over the light's pixels, as the paper counts; for a flat light the visible
-        share of its area above the horizon. [0..1]
+        share of its area above the horizon.  An edge along a side of the viewport is off by up to half
+        a pixel; of a light of which the horizon leaves one corner half the pixels are left, and an
+        edge along the cut can be off by 2 / viewport of them. [0..1]
     untouched_fraction : (m,) float or None
         Share of the light's pixels that no polygon so much as touches (conservative drawing): a
         lower bound of the visible share of a parallelogram light's area. [0..1]
@@ -136,7 +138,8 @@ def camera_shadows(
         ``naive`` draws every polygon at every point; ``optimised`` draws what the plane-vertex
         check leaves, and nothing where that settles the point.  Both give the same answer.
     jitter : str
-        ``none``; ``shift`` moves the sample pattern of each point by a random part of a pixel;
+        ``none``; ``shift`` moves the sample pattern of each point by a random part of a pixel (the
+        viewport is then a pixel wider than the light, which it always covers);
         ``rotate`` turns it as well, which keeps slats from falling in step with the pixels, at the
         price of up to half the pixels.
     seed : int

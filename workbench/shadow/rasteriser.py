@@ -186,14 +186,14 @@ def _distance_to_frame(frame):
 
 @njit(nogil=True, cache=True)
 def _fit(s, n, lamp, tolerance, viewport, angle, shift_u, shift_v, frame, g, lit, lit_start):
-    """Clip the light at the horizon of S and fit a viewport to what is left.
+    """Clip the light at the horizon of S and fit a viewport to what is left: it covers all of that.
 
     Fills ``frame`` (origin - S, U, V), ``g``, and the light's polygons relative to S (``lit``,
     ``lit_start``).  Returns the state, the number of polygons and the frame's determinant.
     """
     pieces = 0
     fill = 0
-    flat = False
+    flat = clipped = False
     lit_start[0] = 0
     for piece in range(len(lamp.start) - 1):
         first, last = lamp.start[piece], lamp.start[piece + 1]
@@ -219,6 +219,7 @@ def _fit(s, n, lamp, tolerance, viewport, angle, shift_u, shift_v, frame, g, lit
                     lit[fill, c] = lamp.corners[i, c] - s[c]
                 fill += 1
             if (above_i > 0.0) != (above_j > 0.0):
+                clipped = True
                 t = above_i / (above_i - above_j)
                 for c in range(3):
                     lit[fill, c] = (1.0 - t) * (lamp.corners[i, c] - s[c]) + t * (lamp.corners[j, c] - s[c])
@@ -269,6 +270,7 @@ def _fit(s, n, lamp, tolerance, viewport, angle, shift_u, shift_v, frame, g, lit
             axis[c] *= farthest
     cosine, sine = np.cos(angle), np.sin(angle)
     low_u, low_v, high_u, high_v = np.inf, np.inf, -np.inf, -np.inf
+    place = np.empty((3, 2))
     for i in range(fill):
         if lamp.planar:
             p, q = 0.0, 0.0
@@ -281,8 +283,28 @@ def _fit(s, n, lamp, tolerance, viewport, angle, shift_u, shift_v, frame, g, lit
         turned_u, turned_v = cosine * p + sine * q, cosine * q - sine * p
         low_u, high_u = min(low_u, turned_u), max(high_u, turned_u)
         low_v, high_v = min(low_v, turned_v), max(high_v, turned_v)
+        if i < 3:
+            place[i, 0], place[i, 1] = turned_u, turned_v
     width, height = high_u - low_u, high_v - low_v
-    u0, v0 = low_u + shift_u * width / viewport, low_v + shift_v * height / viewport
+    # How many of the first three corners lie in the upper half of the frame.
+    upper_u = upper_v = 0
+    for i in range(3):
+        upper_u += 2.0 * place[i, 0] > low_u + high_u
+        upper_v += 2.0 * place[i, 1] > low_v + high_v
+    u0, v0 = low_u, low_v
+    if shift_u != 0.0 or shift_v != 0.0:
+        # A pixel wider than the light, which it covers wherever it is shifted.
+        width, height = width * viewport / (viewport - 1.0), height * viewport / (viewport - 1.0)
+        u0 += (shift_u - 0.5) * width / viewport
+        v0 += (shift_v - 0.5) * height / viewport
+    elif clipped and fill == 3:
+        # A corner that the horizon cuts off: with its sides along the frame's, the cut would run through the
+        # centres of the pixels on the diagonal, all in or all out.  Half a pixel more on the cut's side halves them.
+        width, height = width * viewport / (viewport - 0.5), height * viewport / (viewport - 0.5)
+        if upper_u > 1:
+            u0 = high_u - width
+        if upper_v > 1:
+            v0 = high_v - height
     for c in range(3):
         along, across = cosine * b1[c] + sine * b2[c], cosine * b2[c] - sine * b1[c]
         frame[0, c] = axis[c] + u0 * along + v0 * across
