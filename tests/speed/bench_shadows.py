@@ -298,7 +298,9 @@ def stages(shader: Shader, points: np.ndarray, light: AreaLight, floor: int, err
     finally:
         del shader.tracer.blocked_raw
     parts = ", ".join(f"{name} {seconds:.2f}" for name, seconds in found.seconds.items())
-    counted = ", ".join(f"{name} {found.counters[name]}" for name in ("rays", "exact_cuts", "box_tests"))
+    counted = ", ".join(
+        f"{name} {found.counters[name]}" for name in ("rays", "sender_lines", "silhouette_edges", "exact_cuts")
+    )
     return f"auto at error={error:g}: {parts} s, of it Embree {sum(inside):.2f} s; {counted}"
 
 

@@ -65,11 +65,11 @@ LINE_MARGIN = 0.8
 """Share of the asked error that lines are drawn for: what they state scatters from point to point."""
 PILOT_POINTS = 256
 """Points that give a first idea of the mean irradiance."""
-PILOT_TILES = 24
+PILOT_TILES = 12
 """Tiles that they lie in, at least, where they get lines."""
 PILOT_LINES = 8
 """Lines at each of them."""
-USUAL_NOISE = 0.16
+USUAL_NOISE = 0.22
 """L lines usually leave an error of USUAL_NOISE L^-3/2 of a visible share past a tessellated torus."""
 LIST_LIMIT = 64
 """Longest candidate list of a tile whose points ``auto`` looks at one by one before it draws lines."""

@@ -441,16 +441,29 @@ def _narrow(count, wide, box, ring_box, table, frame, mark, tile_mark, owned, ma
 
 @njit(nogil=True, cache=True)
 def _gather_edges(count, narrow, table, frame, mark, marks, out):
-    """Copy edges with their vertices and unsettled pieces, numbered anew; the numbers of these two."""
+    """Copy edges with their vertices and unsettled pieces, numbered anew.
+
+    Returns the numbers of edges that have none of these pieces, of vertices and of pieces.
+    """
     _, _, _, _, _, ends, _, turn = table
     place, plane = frame[3], frame[4]
     piece_mark, _, piece_number, vertex_mark, vertex_number, _ = marks
     which, base_of, unsettled = narrow
     edge, vertices, pieces, planes = out
-    spots = unsure = 0
+    spots = unsure = settled = 0
+    for c in range(count):
+        settled += unsettled[c, 0] < 0 and unsettled[c, 1] < 0
+    # Edges whose pieces are settled come first: their change of layers is known.
+    front, back = 0, settled
     for c in range(count):
         e = which[c]
-        edge[c, 2] = base_of[c]
+        if unsettled[c, 0] < 0 and unsettled[c, 1] < 0:
+            k = front
+            front += 1
+        else:
+            k = back
+            back += 1
+        edge[k, 2] = base_of[c]
         for s in range(2):
             v = ends[e, s]
             if vertex_mark[v] != mark:
@@ -458,19 +471,19 @@ def _gather_edges(count, narrow, table, frame, mark, marks, out):
                 for axis in range(3):
                     vertices[axis, spots] = place[v, axis]
                 spots += 1
-            edge[c, s] = vertex_number[v]
+            edge[k, s] = vertex_number[v]
             q = unsettled[c, s]
-            edge[c, 3 + s] = edge[c, 5 + s] = 0
+            edge[k, 3 + s] = edge[k, 5 + s] = 0
             if q < 0:
                 continue
             if piece_mark[q] != mark:
                 piece_mark[q], piece_number[q] = mark, unsure
                 pieces[unsure] = q
-                for k in range(4):
-                    planes[k, unsure] = plane[q, k]
+                for i in range(4):
+                    planes[i, unsure] = plane[q, i]
                 unsure += 1
-            edge[c, 3 + s], edge[c, 5 + s] = piece_number[q], -turn[e, s]
-    return spots, unsure
+            edge[k, 3 + s], edge[k, 5 + s] = piece_number[q], -turn[e, s]
+    return settled, spots, unsure
 
 
 @njit(nogil=True, cache=True)
@@ -672,7 +685,7 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
             if narrowed <= CROWDED:
                 if edges > group_room:
                     continue
-                spots, unsure = _gather_edges(edges, group_out, table, frame, mark, group_marks, gathered)
+                settled, spots, unsure = _gather_edges(edges, group_out, table, frame, mark, group_marks, gathered)
             else:
                 _bounds(places, start - first, stop - first, box)
                 edges = _narrow(
@@ -681,7 +694,7 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
                 if edges > group_room:
                     continue
                 mark += 1
-                spots, unsure = _gather_edges(edges, part_out, table, frame, mark, group_marks, gathered)
+                settled, spots, unsure = _gather_edges(edges, part_out, table, frame, mark, group_marks, gathered)
             for i in range(start, stop):
                 if state[i] != STATE_COMPLEX:
                     continue
@@ -708,7 +721,14 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
                     for k in range(lines):
                         before[k] = many[k] = 0
                     _project(group_vertex, spots, px, py, h, y0, dy, lines, over, line, row)
-                    for c in range(edges):
+                    for c in range(settled):
+                        a, b = group_edge[c, 0], group_edge[c, 1]
+                        if row[a] != row[b]:
+                            fits &= _cross(
+                                over[a], line[a], over[b], line[b], group_edge[c, 2], lines, left, right, before,
+                                many, where, steps,
+                            )  # fmt: skip
+                    for c in range(settled, edges):
                         a, b = group_edge[c, 0], group_edge[c, 1]
                         change = (
                             group_edge[c, 2]
@@ -716,7 +736,7 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
                             + group_edge[c, 6] * facing[group_edge[c, 4]]
                         )
                         if (change != 0) & (row[a] != row[b]):
-                            fits = fits and _cross(
+                            fits &= _cross(
                                 over[a], line[a], over[b], line[b], change, lines, left, right, before, many, where,
                                 steps,
                             )  # fmt: skip
