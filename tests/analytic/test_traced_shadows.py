@@ -129,6 +129,14 @@ def test_a_mesh_of_many_faces_takes_rays_and_shines_as_one_light():
     assert math.pi * found.radiance[0, 0] == pytest.approx(E0, rel=0.01)
 
 
+def test_lamps_of_one_name_are_two_lights():
+    halves = [
+        Surface.from_polygons("lamp", LAMP, [ring[::-1]])
+        for ring in (rectangle(-0.5, 0.0, -0.5, 0.5, 2.0), rectangle(0.0, 0.5, -0.5, 0.5, 2.0))
+    ]
+    assert received([0.0], *halves)[0] == pytest.approx(E0, rel=1e-9)
+
+
 def test_two_faces_are_one_light_with_one_state():
     halves = [rectangle(-0.5, 0.0, -0.5, 0.5, 2.0)[::-1], rectangle(0.0, 0.5, -0.5, 0.5, 2.0)[::-1]]
     lamp = Surface.from_polygons("lamp", LAMP, halves)

@@ -484,14 +484,15 @@ class Tracer:
         senders = lights_of_scene(replace(scene, surfaces=surfaces), self.geometry)
         shining = sum(bool(light.power.any()) for light in scene.lights)
         parts: list[list[Sender]] = [[] for _ in self._lights]
-        place = {name: i for i, name in enumerate(self.light_names[shining:], shining)}
+        emitting = [i for i, surface in enumerate(scene.surfaces) if surface.material.emission.any()]
+        place = {surface: i for i, surface in enumerate(emitting, shining)}
         for i, sender in enumerate(senders):
             if i < shining:
                 if isinstance(sender, LinearLight):
                     parts[i].append(sender)
             else:
                 surface = int(self.geometry.polygon_surface[sender.polygons[0]])
-                parts[place[scene.surfaces[surface].name]].append(sender)
+                parts[place[surface]].append(sender)
         self._lights = [
             replace(light, senders=tuple(own) if len(own) <= SOFT_FACES else ())
             for light, own in zip(self._lights, parts, strict=True)
