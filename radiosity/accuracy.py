@@ -58,6 +58,8 @@ COST_POWER = 1.7
 """Power of the number of elements with which the seconds grow."""
 GATHERED = 5.0
 """Number of elements times the sum of squared form factors from a point to them: 1 in a sphere, 3 to 6 in rooms."""
+MATRIX_POLYGONS = 2000
+"""Scenes of at most so many polygons are solved with the full matrix."""
 MOST_LEVELS = 12
 MOST_TRIES = 5
 """Solves of one given mesh, each with better form factors."""
@@ -126,6 +128,7 @@ class _Run:
     seen: FloatArray | None = None
     counters: Counters = field(default_factory=Counters)
     spent: dict[str, float] = field(default_factory=dict)
+    choices: dict[str, str] = field(default_factory=dict)
 
     @property
     def left(self) -> float:
@@ -257,7 +260,7 @@ def _finish(run: _Run, solution: Solution, estimate: ErrorEstimate, reason: str)
     record.results.pop("level_irradiance", None)
     reached = run.target > 0 and estimate.total <= run.target
     record.results["target_reached"] = reached
-    record.choices["stop"] = reason
+    record.choices |= run.choices | {"stop": reason}
     solution.converged = solution.converged and (reached or run.target == 0.0)
     return solution
 
@@ -265,6 +268,19 @@ def _finish(run: _Run, solution: Solution, estimate: ErrorEstimate, reason: str)
 def _first_error(run: _Run) -> float:
     """Error by which the first mesh is chosen; without a target, a rough one."""
     return run.target if run.target > 0 else 0.1
+
+
+def _method(scene: Scene, run: _Run) -> str:
+    """The solver for all meshes of a run."""
+    asked = str(run.options.get("method", "auto"))
+    if asked != "auto":
+        return asked
+    polygons = sum(surface.face_count for surface in scene.surfaces)
+    if polygons <= MATRIX_POLYGONS:
+        run.choices["method"] = f"matrix: {polygons} polygons, all form factors at once up to {MATRIX_POLYGONS}"
+        return "matrix"
+    run.choices["method"] = f"progressive: {polygons} polygons, whose small facets are clustered"
+    return "progressive"
 
 
 def _refine(
@@ -278,6 +294,7 @@ def _refine(
     count = max(16, round(FIRST_ELEMENTS / max(_first_error(run), LEAST_FIRST_ERROR)))
     if math.isfinite(run.seconds):
         count = min(count, BUDGET_ELEMENTS)
+    method = _method(scene, run)
     unfinished = resume
     if resume is not None:
         run.levels = list(resume.record.results.get("levels", []))
@@ -288,6 +305,7 @@ def _refine(
         # No finer than this mesh can be right.
         finest = max(run.target, 0.3 / count)
         options = run.options | {
+            "method": method,
             "elements": count,
             "tolerance": min(0.1 * finest, 0.01),
             "form_factor_error": min(2.0 * finest, 0.02),

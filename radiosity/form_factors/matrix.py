@@ -33,7 +33,7 @@ from workbench.memory import require_memory
 from workbench.record import RunRecord
 from workbench.scene.model import Scene
 
-__all__ = ["ViewFactors", "close_rows", "view_factors"]
+__all__ = ["ViewFactors", "close_rows", "exchange_areas", "view_factors"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -670,6 +670,47 @@ def view_factors(
         found = _finished(scene, exchange, spread, areas, names, record)
     record.results.update(rows=len(names), pieces=n, occluders=engine.occluders.count, sparse=found.sparse)
     return found
+
+
+def exchange_areas(
+    mesh: PatchMesh,
+    geometry: Geometry,
+    record: RunRecord,
+    *,
+    error: float = 1e-3,
+    workers: int = 1,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Exchange areas ``A_i F_ij`` between the elements of a mesh, reciprocal by construction, and their errors.
+
+    Parameters
+    ----------
+    mesh, geometry : PatchMesh, Geometry
+    record : RunRecord
+        Gets the counters.
+    error : float
+        As in :func:`view_factors`.
+    workers, seed, progress
+        As in :func:`view_factors`.
+
+    Returns
+    -------
+    exchange, spread : (n, n) float
+        [scene lengths squared]
+
+    Raises
+    ------
+    MemoryForecastError
+        If the matrix would not fit in memory.
+    """
+    n = mesh.element_count
+    engine = _Engine(mesh, geometry, _Care.for_error(error, n), seed)
+    require_memory(3.0 * DENSE_ENTRY * n**2, f"a matrix of {n} x {n} form factors", "ask for fewer elements")
+    engine.prepare_rays()
+    exchange, spread = _all_exchanges(engine, engine.pieces.owner, n, workers, record, progress)
+    whole = [part if isinstance(part, np.ndarray) else part.toarray() for part in (exchange, spread)]
+    return whole[0], whole[1]
 
 
 def _all_exchanges(

@@ -25,7 +25,7 @@ from radiosity.form_factors.bundle import ColumnFinder
 from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, ShootingState, Solution
 from workbench.memory import available_bytes
 
-__all__ = ["remaining_bound", "shoot_until"]
+__all__ = ["LEAST_ROW_SUM", "receive", "remaining_bound", "shoot_until"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -62,7 +62,7 @@ def remaining_bound(solution: Solution) -> float:
     return float(np.divide(coming, whole, out=np.zeros_like(coming), where=whole > 0).max(initial=0.0))
 
 
-def _receive(solution: Solution, factor: FloatArray, senders: IntArray, sent: FloatArray) -> None:
+def receive(solution: Solution, factor: FloatArray, senders: IntArray, sent: FloatArray) -> None:
     """Carry radiosity ``sent`` (k, bands) from patches ``senders`` to all elements; keep the book."""
     mesh, book = solution.mesh, solution.book
     arriving = factor.T @ sent
@@ -85,7 +85,7 @@ def _shoot(solution: Solution, state: ShootingState, patches: IntArray, factor: 
     state.sent[patches] += sent
     for patch in patches:
         solution.unshot[mesh.patch_start[patch] : mesh.patch_start[patch + 1]] = 0.0
-    _receive(solution, factor, patches, sent)
+    receive(solution, factor, patches, sent)
 
 
 def _solve_rest(solution: Solution, state: ShootingState, senders: IntArray, factor: FloatArray) -> None:
@@ -103,7 +103,7 @@ def _solve_rest(solution: Solution, state: ShootingState, senders: IntArray, fac
         system = np.eye(len(senders)) - back / mesh.patch_area[senders][:, None]
         total[:, band] = np.linalg.solve(system, unshot[:, band])
     state.sent[senders] += total
-    _receive(solution, factor, senders, total)
+    receive(solution, factor, senders, total)
     # All that arrived has been shot again within ``total``.
     solution.unshot[:] = 0.0
 

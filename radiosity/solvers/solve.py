@@ -13,7 +13,7 @@ import numpy as np
 from radiosity.form_factors.bundle import ColumnFinder, LinkSettings, ReceiverBundles
 from radiosity.form_factors.directional import DirectionalBundles
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
-from radiosity.solvers.direct import solve_direct
+from radiosity.solvers.direct import solve_direct, solve_matrix
 from radiosity.solvers.hierarchical import solve_hierarchical
 from radiosity.solvers.incident import incident_irradiance
 from radiosity.solvers.progressive import shoot_until
@@ -26,9 +26,11 @@ from workbench.scene.model import Scene
 
 __all__ = ["solve"]
 
-METHODS = ("auto", "progressive", "direct", "hierarchical")
+METHODS = ("auto", "progressive", "direct", "matrix", "hierarchical")
 BUNDLES: dict[str, Callable[..., ColumnFinder]] = {"receiver": ReceiverBundles, "directional": DirectionalBundles}
 """How form factors are found: from the receivers toward a patch, or from the patch into its hemisphere."""
+FULL = ("direct", "matrix")
+"""Methods that find all form factors before they solve."""
 
 DEFAULT_ELEMENTS = 2000
 DEFAULT_LINK_ERROR = 1e-3
@@ -104,8 +106,8 @@ def _forecast(scene: Scene, elements: int | None, max_edge: float | None, method
     count = float(elements) if elements is not None else float(forecast_elements(scene, max_edge or math.inf))
     advice = "ask for fewer elements or a larger max_edge"
     require_memory(count * (_ELEMENT_BYTES + 64 * scene.bands), f"a mesh of {count:.3g} elements", advice)
-    if method == "direct":
-        require_memory(32.0 * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", advice)
+    if method in FULL:
+        require_memory(40.0 * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", advice)
 
 
 def _note_materials(geometry: Geometry, record: RunRecord) -> None:
@@ -192,7 +194,8 @@ def solve(
         From :func:`workbench.load` or built in code.
     method : str
         ``progressive`` (shooting), ``hierarchical`` (links at the coarsest level that will do, elements
-        where the light changes), ``direct`` (full matrix; small scenes), or ``auto``.
+        where the light changes), ``direct`` (full matrix, by columns; small scenes), ``matrix`` (full
+        matrix, reciprocal by construction, pairs settled in groups; up to some thousand elements), or ``auto``.
     elements : int, optional
         About how many elements; 1 gives one a polygon.  Default 2,000 (or one a polygon, if there
         are more polygons).
@@ -299,9 +302,9 @@ def solve(
     if method == "auto":
         method = "direct" if n <= DIRECT_ELEMENTS else "progressive"
         record.choices["method"] = f"{method}: {n} elements, direct up to {DIRECT_ELEMENTS}"
-    if mesh.patch_count < n and (method == "direct" or n <= ONE_LEVEL_ELEMENTS):
+    if mesh.patch_count < n and (method in FULL or n <= ONE_LEVEL_ELEMENTS):
         with record.stage("mesh"):
-            cluster = method != "direct"
+            cluster = method not in FULL
             mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=cluster)
         n = mesh.element_count
     _forecast(scene, n, None, method)
@@ -310,8 +313,8 @@ def solve(
     with record.stage("prepare"):
         finder = BUNDLES[bundles](geometry, mesh, _settings(error, rays, seed, mesh.patch_count), count)
     try:
-        if resume is None or method == "direct":
-            # A direct solve has no half-way state to go on from.
+        if resume is None or method in FULL:
+            # A full solve has no half-way state to go on from.
             with record.stage("incident light"):
                 incident = incident_irradiance(scene, mesh, finder.accelerator, seed=seed)
             solution = _start(scene, mesh, incident, record)
@@ -320,6 +323,17 @@ def solve(
             solution = _resumed(scene, mesh, resume, record)
         if method == "direct":
             solve_direct(solution, finder, closed=scene.closed, progress=progress)
+        elif method == "matrix":
+            solve_matrix(
+                solution,
+                geometry,
+                finder,
+                error=error,
+                closed=scene.closed,
+                workers=count,
+                seed=seed,
+                progress=progress,
+            )
         else:
             shoot_until(solution, finder, tolerance=tolerance, progress=progress, checkpoint=checkpoint)
     finally:
