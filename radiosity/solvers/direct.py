@@ -87,11 +87,16 @@ def solve_direct(solution: Solution, bundles: ColumnFinder, *, closed: bool, pro
     record.errors["reciprocity"] = float(np.abs(exchange - exchange.T).max() / max(float(exchange.max()), 1e-300))
     with record.stage("solve"):
         seen = solve_exchange(solution, 0.5 * (exchange + exchange.T), factor.sum(axis=1), doubt, closed=closed)
-    square = mean_square.T @ seen**2
+    square = mean_square.T @ _told_apart(seen, mesh.element_area, closed) ** 2
     solution.state_irradiance_error(form_factors=square[0], visibility=square[1])
     record.counters.merge(bundles.counters)
     record.counters.add(shots=n)
     record.seconds["inside embree, summed over threads"] = bundles.seconds_in_embree
+
+
+def _told_apart(seen: FloatArray, area: FloatArray, closed: bool) -> FloatArray:
+    """The radiosity on which errors of form factors act: in rows that sum to 1 its mean counts for nothing."""
+    return seen - (area @ seen) / area.sum() if closed else seen
 
 
 def _bounce(exchange: FloatArray, area: FloatArray, rho: FloatArray, before: FloatArray) -> FloatArray:
@@ -248,7 +253,7 @@ def solve_matrix(
         area = mesh.element_area
         doubt = spread.sum(axis=1) / area
         seen = solve_exchange(solution, exchange, exchange.sum(axis=1) / area, doubt, closed=closed)
-        variance = (spread / area[:, None]) ** 2 @ seen**2
+        variance = (spread / area[:, None]) ** 2 @ _told_apart(seen, area, closed) ** 2
         square[0] += area @ variance / area.sum()
     solution.state_irradiance_error(form_factors=square[0], visibility=square[1])
     record.errors["reciprocity"] = 0.0
