@@ -44,13 +44,13 @@ def _rectangles():
                 yield f"box{number}{name}", face
 
 
-def _steps(face, edge):
+def _steps(face, edge, up):
     sides = np.linalg.norm(face[1] - face[0]), np.linalg.norm(face[3] - face[0])
-    return [max(1, int(np.ceil(side / edge - 1e-9))) for side in sides]
+    return [max(1, int(np.floor(side / edge + up - 1e-9))) for side in sides]
 
 
-def _triangles(face, edge):
-    nu, nv = _steps(face, edge)
+def _triangles(face, edge, up):
+    nu, nv = _steps(face, edge, up)
     u, v = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
     u, v = u[..., None], v[..., None]
     grid = face[0] * (1 - u) * (1 - v) + face[1] * u * (1 - v) + face[2] * u * v + face[3] * (1 - u) * v
@@ -60,11 +60,11 @@ def _triangles(face, edge):
             yield from ([a, b, c], [a, c, d]) if (i + j) % 2 == 0 else ([a, b, d], [b, c, d])
 
 
-def closed_room(edge: float) -> Scene:
-    """The room in triangles whose legs are at most ``edge``."""
+def closed_room(edge: float, up: float = 1.0) -> Scene:
+    """The room in triangles whose legs are about ``edge``: at most that if ``up`` is 1, the nearest number if 0.5."""
     surfaces: dict[str, list] = {}
     for name, face in _rectangles():
-        surfaces.setdefault(name, []).extend(_triangles(face, edge))
+        surfaces.setdefault(name, []).extend(_triangles(face, edge, up))
     material = diffuse("paint", 0.5)
     parts = tuple(
         Surface.from_mesh(
@@ -81,8 +81,8 @@ def closed_room(edge: float) -> Scene:
 def room_of(triangles: int) -> Scene:
     """The room in as nearly ``triangles`` triangles as its grids allow."""
 
-    def count(edge):
-        return sum(2 * int(np.prod(_steps(face, edge))) for _, face in _rectangles())
+    def count(choice):
+        return sum(2 * int(np.prod(_steps(face, *choice))) for _, face in _rectangles())
 
-    edges = np.geomspace(0.02, 3.0, 4000)
-    return closed_room(float(min(edges, key=lambda edge: abs(count(edge) - triangles))))
+    choices = [(edge, up) for up in np.linspace(0.5, 1.0, 6) for edge in np.geomspace(0.05, 3.0, 800)]
+    return closed_room(*min(choices, key=lambda choice: abs(count(choice) - triangles)))

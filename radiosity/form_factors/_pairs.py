@@ -42,6 +42,9 @@ MAX_FRAGMENTS = 96
 ROOM = 24
 """Corners that a fragment may have."""
 
+FAR_SHARE = 0.3
+"""Part of the wanted error of a visible share that the kernel at centroids may take."""
+
 _INV_PI = 1.0 / math.pi
 
 _PLAIN = {"nogil": True, "cache": True, "_nrt": False}
@@ -223,14 +226,24 @@ def _fragment_share(fragments, row, count, nx, ny, nz):
 
 
 @njit(**_PLAIN)
-def seen_share(
-    x, y, z, nx, ny, nz, target, t0, t1, corners, start, normal, offset, through, kept, many, fragments, sizes,
-    weights, tally,
-):  # fmt: skip
-    """Form factor from a point to what it sees of a convex polygon past its occluders; -1 without room.
+def _fragment_flux(fragments, row, count, nx, ny, nz, mx, my, mz):
+    """Form factor from the origin to a small far fragment with normal m: the kernel at its parts' centroids."""
+    ax, ay, az = fragments[row, 0, 0], fragments[row, 0, 1], fragments[row, 0, 2]
+    total = 0.0
+    for k in range(1, count - 1):
+        bx, by, bz = fragments[row, k, 0], fragments[row, k, 1], fragments[row, k, 2]
+        cx, cy, cz = fragments[row, k + 1, 0], fragments[row, k + 1, 1], fragments[row, k + 1, 2]
+        ux, uy, uz, vx, vy, vz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
+        twice = mx * (uy * vz - uz * vy) + my * (uz * vx - ux * vz) + mz * (ux * vy - uy * vx)
+        gx, gy, gz = (ax + bx + cx) / 3.0, (ay + by + cy) / 3.0, (az + bz + cz) / 3.0
+        square = gx * gx + gy * gy + gz * gz
+        total -= twice * (nx * gx + ny * gy + nz * gz) * (mx * gx + my * gy + mz * gz) / (square * square)
+    return 0.5 * _INV_PI * total
 
-    ``kept[:many]`` are the occluders ``corners[start[k]:start[k + 1]]``.
-    """
+
+@njit(**_PLAIN)
+def _load(target, t0, t1, x, y, z, fragments, sizes, weights):
+    """Make the whole polygon, relative to (x, y, z), the only fragment; its reach."""
     reach = 0.0
     for i in range(t1 - t0):
         rx, ry, rz = target[t0 + i, 0] - x, target[t0 + i, 1] - y, target[t0 + i, 2] - z
@@ -238,6 +251,14 @@ def seen_share(
         reach = max(reach, abs(rx), abs(ry), abs(rz))
     sizes[0] = t1 - t0
     weights[0] = 1.0
+    return reach
+
+
+@njit(**_PLAIN)
+def _cut(
+    x, y, z, reach, corners, start, normal, offset, through, kept, many, fragments, sizes, weights, tally
+):  # fmt: skip
+    """Take from the loaded polygon all that the occluders hide from (x, y, z); fragments left, -1 without room."""
     count = 1
     near = 1e-12 * reach
     for c in range(many):
@@ -250,9 +271,25 @@ def seen_share(
             break
     if count < 0:
         tally[OVERFLOW] += 1
-        return -1.0
+        return -1
     tally[CUT] += 1
     tally[PIECES] += count
+    return count
+
+
+@njit(**_PLAIN)
+def seen_share(
+    x, y, z, nx, ny, nz, target, t0, t1, corners, start, normal, offset, through, kept, many, fragments, sizes,
+    weights, tally,
+):  # fmt: skip
+    """Form factor from a point to what it sees of a convex polygon past its occluders; -1 without room.
+
+    ``kept[:many]`` are the occluders ``corners[start[k]:start[k + 1]]``.
+    """
+    reach = _load(target, t0, t1, x, y, z, fragments, sizes, weights)
+    count = _cut(x, y, z, reach, corners, start, normal, offset, through, kept, many, fragments, sizes, weights, tally)
+    if count < 0:
+        return -1.0
     total = 0.0
     for f in range(count):
         total += weights[f] * max(_fragment_share(fragments, f, sizes[f], nx, ny, nz), 0.0)
@@ -413,6 +450,63 @@ def _gap(centroid, s, low, high, t):
     return math.sqrt(square)
 
 
+@njit(**_PLAIN)
+def _clipped_sum(work, m, k, normal, i, j):
+    """Exchange area of the clipped polygons ``work[2, :m]`` and ``work[3, :k]`` by three points a triangle.
+
+    Also what they would exchange face to face, and the larger one's radius over their distance.
+    """
+    nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+    mx, my, mz = normal[j, 0], normal[j, 1], normal[j, 2]
+    px = py = pz = qx = qy = qz = 0.0
+    for c in range(m):
+        px, py, pz = px + work[2, c, 0] / m, py + work[2, c, 1] / m, pz + work[2, c, 2] / m
+    for c in range(k):
+        qx, qy, qz = qx + work[3, c, 0] / k, qy + work[3, c, 1] / k, qz + work[3, c, 2] / k
+    square = (px - qx) ** 2 + (py - qy) ** 2 + (pz - qz) ** 2
+    largest = 0.0
+    for c in range(m):
+        largest = max(
+            largest, (work[2, c, 0] - px) ** 2 + (work[2, c, 1] - py) ** 2 + (work[2, c, 2] - pz) ** 2
+        )  # fmt: skip
+    for c in range(k):
+        largest = max(
+            largest, (work[3, c, 0] - qx) ** 2 + (work[3, c, 1] - qy) ** 2 + (work[3, c, 2] - qz) ** 2
+        )  # fmt: skip
+    if largest >= square:
+        return 0.0, 0.0, math.inf
+    total = facing = 0.0
+    for f in range(1, m - 1):
+        # Cross products with the unit normal's direction: areas of the fan's triangles.
+        ax, ay, az = work[2, f, 0] - work[2, 0, 0], work[2, f, 1] - work[2, 0, 1], work[2, f, 2] - work[2, 0, 2]
+        bx, by, bz = (
+            work[2, f + 1, 0] - work[2, 0, 0], work[2, f + 1, 1] - work[2, 0, 1], work[2, f + 1, 2] - work[2, 0, 2]
+        )  # fmt: skip
+        area_p = 0.5 * abs(nx * (ay * bz - az * by) + ny * (az * bx - ax * bz) + nz * (ax * by - ay * bx))
+        for g in range(1, k - 1):
+            cx, cy, cz = work[3, g, 0] - work[3, 0, 0], work[3, g, 1] - work[3, 0, 1], work[3, g, 2] - work[3, 0, 2]
+            dx, dy, dz = (
+                work[3, g + 1, 0] - work[3, 0, 0], work[3, g + 1, 1] - work[3, 0, 1], work[3, g + 1, 2] - work[3, 0, 2]
+            )  # fmt: skip
+            area_q = 0.5 * abs(mx * (cy * dz - cz * dy) + my * (cz * dx - cx * dz) + mz * (cx * dy - cy * dx))
+            facing += area_p * area_q
+            row = 0.0
+            for s in range(3):
+                u, v = (2.0 / 3.0 if s == 1 else 1.0 / 6.0), (2.0 / 3.0 if s == 2 else 1.0 / 6.0)
+                x, y, z = (
+                    work[2, 0, 0] + u * ax + v * bx, work[2, 0, 1] + u * ay + v * by, work[2, 0, 2] + u * az + v * bz
+                )  # fmt: skip
+                for t in range(3):
+                    u, v = (2.0 / 3.0 if t == 1 else 1.0 / 6.0), (2.0 / 3.0 if t == 2 else 1.0 / 6.0)
+                    ex = work[3, 0, 0] + u * cx + v * dx - x
+                    ey = work[3, 0, 1] + u * cy + v * dy - y
+                    ez = work[3, 0, 2] + u * cz + v * dz - z
+                    r2 = ex * ex + ey * ey + ez * ez
+                    row -= (ex * nx + ey * ny + ez * nz) * (ex * mx + ey * my + ez * mz) / (r2 * r2)
+            total += area_p * area_q * row / 9.0
+    return max(total, 0.0) * _INV_PI, facing * _INV_PI / square, math.sqrt(largest / square)
+
+
 POINT_RULE, COARSE_RULE, FINE_RULE, LAMBERT_RULE = 0.45, 0.26, 0.065, 0.04
 """Relative errors of the rules at a distance of one radius, root mean square over the pairs of rooms in triangles;
 they fall with its 2nd, 4th and (both others) 5.6th power."""
@@ -476,6 +570,10 @@ def open_exchange(
     if m <= 0 or k <= 0:
         return 0.0, 0.0
     smaller = min(area[i], area[j])
+    if straddle:
+        value, facing, ratio = _clipped_sum(work, m, k, normal, i, j)
+        if ratio * reach[1] < 1.0:
+            return value, rule_doubt(value, facing, COARSE_RULE, 4.0, ratio)
     value, rounding = contour_integral_in(work[2], m, work[3], k, 0.1 * error * smaller, contour)
     # Never above what one of them can send; a closer look where little is exchanged.
     if value < 0.3 * smaller:
@@ -488,7 +586,7 @@ def open_exchange(
 
 @njit(**_PLAIN)
 def _sampled(
-    i, j, points, p0, p1, corners, start, normal, kc, ks, kn, kd, through, kept, many, fragments, sizes, weights,
+    i, j, far, points, p0, p1, corners, start, normal, kc, ks, kn, kd, through, kept, many, fragments, sizes, weights,
     tally, sums,
 ):  # fmt: skip
     """Visible and open form factors of piece j, summed over points of piece i; whether there was room.
@@ -505,14 +603,22 @@ def _sampled(
         x, y, z, w = points[p, 0], points[p, 1], points[p, 2], points[p, 3]
         if mx * x + my * y + mz * z - d <= 0.0:
             continue
-        clear = lambert_piece(x, y, z, nx, ny, nz, corners, t0, t1)
+        reach = _load(corners, t0, t1, x, y, z, fragments, sizes, weights)
+        if far:
+            clear = _fragment_flux(fragments, 0, t1 - t0, nx, ny, nz, mx, my, mz)
+        else:
+            clear = _fragment_share(fragments, 0, t1 - t0, nx, ny, nz)
         if clear <= 0.0:
             continue
-        share = seen_share(
-            x, y, z, nx, ny, nz, corners, t0, t1, kc, ks, kn, kd, through, kept, many, fragments, sizes, weights, tally
-        )  # fmt: skip
-        if share < 0.0:
+        count = _cut(x, y, z, reach, kc, ks, kn, kd, through, kept, many, fragments, sizes, weights, tally)
+        if count < 0:
             return False
+        share = 0.0
+        for f in range(count):
+            if far:
+                share += weights[f] * _fragment_flux(fragments, f, sizes[f], nx, ny, nz, mx, my, mz)
+            else:
+                share += weights[f] * max(_fragment_share(fragments, f, sizes[f], nx, ny, nz), 0.0)
         whole += w * clear
         seen += w * share
         part = share / clear
@@ -523,18 +629,18 @@ def _sampled(
 
 @njit(**_PLAIN)
 def partial_share(
-    i, j, goal, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, many, fragments,
+    i, j, far, goal, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, many, fragments,
     sizes, weights, sums, tally,
 ):  # fmt: skip
     """Visible share of the exchange of two pieces and the estimate of its error; -1 if rays must tell.
 
-    Points of ever finer rules on piece i, until two in a row agree to ``goal``.
+    Points of ever finer rules on piece i, until two in a row agree to ``goal``; ``far`` as in the caller.
     """
     before, doubt = -1.0, 1.0
     share = 0.0
     for level in range(levels):
         if not _sampled(
-            i, j, rules, rule_starts[level, i], rule_starts[level, i + 1], corners, start, normal, kc, ks, kn,
+            i, j, far, rules, rule_starts[level, i], rule_starts[level, i + 1], corners, start, normal, kc, ks, kn,
             kd, through, kept, many, fragments, sizes, weights, tally, sums,
         ):  # fmt: skip
             return -1.0, 1.0
@@ -606,8 +712,11 @@ def _one_pair(
         return value, doubt, 1
     s, t = (i, j) if radius[i] <= radius[j] else (j, i)
     goal = share_error * (1.0 + floor * min(area[i], area[j]) / value)
+    dx, dy, dz = centroid[i, 0] - centroid[j, 0], centroid[i, 1] - centroid[j, 1], centroid[i, 2] - centroid[j, 2]
+    # Of small polygons far away the kernel at a fragment's centroid tells its share as well as Lambert's formula.
+    far = not straddle and POINT_RULE * radius[t] * radius[t] < FAR_SHARE * goal * (dx * dx + dy * dy + dz * dz)
     share, uncertain = partial_share(
-        s, t, goal, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, used,
+        s, t, far, goal, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, used,
         fragments, sizes, weights, sums, tally,
     )  # fmt: skip
     if share < 0.0:
@@ -810,12 +919,13 @@ def stripe(
                 square = dx * dx + dy * dy + dz * dz
                 limit_distance = nearest * max(radius[i], radius[j])
                 if not straddle and square > limit_distance * limit_distance:
-                    value = area[i] * area[j] * over_i * over_j / (square * square) * _INV_PI
-                    out[i - base, j] = value
-                    spread[i - base, j] = rule_doubt(
-                        value, area[i] * area[j] * _INV_PI / square, POINT_RULE, 2.0,
-                        max(radius[i], radius[j]) / math.sqrt(square),
-                    )  # fmt: skip
+                    # rule_doubt with one division and one root: most pairs end here.
+                    inverse = 1.0 / square
+                    facing = area[i] * area[j] * _INV_PI * inverse
+                    cosines = over_i * over_j * inverse
+                    larger = max(radius[i], radius[j])
+                    out[i - base, j] = facing * cosines
+                    spread[i - base, j] = POINT_RULE * larger * larger * inverse * facing * math.sqrt(cosines)
                     tally[CLOSED] += 1
                     tally[CLEAR] += 1
                     tally[LINK] += 1
@@ -833,3 +943,27 @@ def stripe(
                         flagged[flags, 0], flagged[flags, 1] = i, j
                     flags += 1
     return flags
+
+
+@njit(**_PLAIN)
+def count_pairs(spread, rows):
+    """Number of places of ``spread[:rows]`` that are not 0."""
+    count = 0
+    for i in range(rows):
+        for j in range(spread.shape[1]):
+            if spread[i, j] != 0.0:
+                count += 1
+    return count
+
+
+@njit(**_PLAIN)
+def take_pairs(out, spread, rows, base, first, second, values, errors):
+    """Move what is not 0 into lists and leave zeros."""
+    count = 0
+    for i in range(rows):
+        for j in range(spread.shape[1]):
+            if spread[i, j] != 0.0:
+                first[count], second[count] = base + i, j
+                values[count], errors[count] = out[i, j], spread[i, j]
+                out[i, j] = spread[i, j] = 0.0
+                count += 1

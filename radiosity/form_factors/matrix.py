@@ -144,7 +144,63 @@ def _rule_points(
     return start, out
 
 
-def _mesh_pieces(mesh: PatchMesh, occluders: Occluders) -> _Pieces:
+@dataclass(frozen=True)
+class _Elements:
+    """What matrices read of a mesh; of whole polygons it is made without one, at once."""
+
+    corners: FloatArray
+    piece_start: IntArray
+    piece_element: IntArray
+    piece_normal: FloatArray
+    element_area: FloatArray
+    element_polygon: IntArray
+    element_surface: IntArray
+    element_side: IntArray
+
+    @property
+    def element_count(self) -> int:
+        return len(self.element_area)
+
+    @classmethod
+    def of_mesh(cls, mesh: PatchMesh) -> _Elements:
+        """The elements of a divided scene."""
+        return cls(
+            mesh.corners, mesh.piece_start, mesh.piece_element, mesh.piece_normal, mesh.element_area,
+            mesh.element_polygon, mesh.element_surface, mesh.element_side,
+        )  # fmt: skip
+
+    @classmethod
+    def of_polygons(cls, geometry: Geometry) -> _Elements:
+        """A polygon an element, and its back another where both sides exchange."""
+        two = np.asarray([material.two_sided for material in geometry.surface_material], dtype=bool)
+        both = two[geometry.polygon_surface]
+        polygon = np.repeat(np.arange(geometry.polygon_count), np.where(both, 2, 1))
+        side = np.ones(len(polygon), dtype=np.int64)
+        side[1:][polygon[1:] == polygon[:-1]] = -1
+        # Pieces of each element, and the corners of each piece: backwards on backs.
+        first, last = geometry.polygon_piece_start[polygon], geometry.polygon_piece_start[polygon + 1]
+        owner = np.repeat(np.arange(len(polygon)), last - first)
+        piece = np.arange(len(owner)) - np.repeat(np.cumsum(last - first) - (last - first), last - first)
+        piece += np.repeat(first, last - first)
+        sizes = np.diff(geometry.piece_start)[piece]
+        start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        step = np.arange(start[-1]) - np.repeat(start[:-1], sizes)
+        turned = np.repeat(side[owner] < 0, sizes)
+        row = np.where(turned, np.repeat(geometry.piece_start[piece + 1] - 1, sizes) - step, step)
+        row = np.where(turned, row, row + np.repeat(geometry.piece_start[piece], sizes))
+        return cls(
+            np.ascontiguousarray(geometry.corners[row]),
+            start,
+            owner.astype(np.int64),
+            np.ascontiguousarray(geometry.piece_normal[piece] * side[owner, None]),
+            geometry.polygon_area[polygon],
+            polygon.astype(np.int64),
+            geometry.polygon_surface[polygon],
+            side,
+        )
+
+
+def _mesh_pieces(mesh: _Elements, occluders: Occluders) -> _Pieces:
     """The pieces of a mesh, in its order."""
     start = mesh.piece_start
     sizes = np.diff(start)
@@ -177,7 +233,7 @@ def _mesh_pieces(mesh: PatchMesh, occluders: Occluders) -> _Pieces:
     )
 
 
-def _group_normals(mesh: PatchMesh, occluders: Occluders, polygon: IntArray) -> FloatArray:
+def _group_normals(mesh: _Elements, occluders: Occluders, polygon: IntArray) -> FloatArray:
     """One normal a plane group, at each piece."""
     normal = np.empty((int(occluders.polygon_group.max()) + 1, 3))
     normal[occluders.polygon_group[polygon]] = mesh.piece_normal
@@ -318,7 +374,7 @@ class _Care:
 class _Engine:
     """What the stripes of one matrix share: arrays, settings, threads' scratch."""
 
-    def __init__(self, mesh: PatchMesh, geometry: Geometry, care: _Care, seed: int) -> None:
+    def __init__(self, mesh: _Elements, geometry: Geometry, care: _Care, seed: int) -> None:
         self.occluders = join_coplanar(geometry)
         pieces = _mesh_pieces(mesh, self.occluders)
         self.tree, order = _build_tree(pieces)
@@ -356,8 +412,8 @@ class _Engine:
             np.empty((16, 3)),
             np.empty(96 * (self.occluders.count + 1), dtype=np.int64),
             np.empty((1024, 4), dtype=np.int64),
-            np.empty((widest, self.pieces.count)),
-            np.empty((widest, self.pieces.count)),
+            np.zeros((widest, self.pieces.count)),
+            np.zeros((widest, self.pieces.count)),
         )
 
     def stripe(self, node: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray, NDArray[np.int64], int]:
@@ -366,8 +422,6 @@ class _Engine:
         try:
             rows = int(self.tree.last[node] - self.tree.first[node])
             out, spread = scratch[-2][:rows], scratch[-1][:rows]
-            out[:] = 0.0
-            spread[:] = 0.0
             room = 4096
             while True:
                 flagged = np.empty((room, 2), dtype=np.int64)
@@ -381,8 +435,11 @@ class _Engine:
             if flags:
                 traced = self._by_rays(flagged[:flags], base, out, spread)
             # A pair that no point saw may still exchange a little: its error stays.
-            i, j = np.nonzero(spread)
-            return i + base, j, out[i, j], spread[i, j], tally, traced
+            count = _pairs.count_pairs(spread, rows)
+            i, j = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+            value, error = np.empty(count), np.empty(count)
+            _pairs.take_pairs(out, spread, rows, base, i, j, value, error)
+            return i, j, value, error, tally, traced
         finally:
             self._idle.append(scratch)
 
@@ -435,8 +492,31 @@ def close_rows(exchange: Matrix, wanted: FloatArray) -> FloatArray:
         ratio = np.divide(wanted, sums, out=np.ones(len(wanted)), where=live)
         if np.abs(ratio - 1.0).max(initial=0.0) < CLOSED_TO:
             break
-        x *= np.sqrt(ratio)
+        step = _newton_step(exchange, x, sums, np.where(live, wanted - sums, 0.0))
+        # Far from the goal a step could turn a sign: there the plain scaling goes on.
+        x *= 1.0 + step if np.abs(step).max() < 0.3 else np.sqrt(ratio)
     return x
+
+
+def _newton_step(exchange: Matrix, x: FloatArray, sums: FloatArray, missing: FloatArray) -> FloatArray:
+    """Relative change d of x by Newton: ``(diag(sums) + X S X) d = missing``, by conjugate gradients."""
+    diagonal = np.where(sums > 0, sums, 1.0)
+    d = np.zeros_like(x)
+    rest = missing.copy()
+    along = rest / diagonal
+    square = float(rest @ along)
+    goal = 1e-8 * square
+    for _ in range(50):
+        if square <= goal:
+            break
+        image = sums * along + x * (exchange @ (x * along))
+        step = square / float(along @ image)
+        d += step * along
+        rest -= step * image
+        scaled = rest / diagonal
+        square, before = float(rest @ scaled), square
+        along = scaled + square / before * along
+    return d
 
 
 @dataclass(frozen=True)
@@ -540,7 +620,7 @@ class ViewFactors:
                 )
 
 
-def _names(mesh: PatchMesh, geometry: Geometry, by: str) -> tuple[IntArray, list[str]]:
+def _names(mesh: _Elements, geometry: Geometry, by: str) -> tuple[IntArray, list[str]]:
     """Row of each element, and the name of each row."""
     back = mesh.element_side < 0
     if by == "surface":
@@ -630,7 +710,7 @@ def view_factors(
     Clear pairs get a closed form or a quadrature of that accuracy; pairs behind a few polygons are cut
     exactly at the points of a rule (facets of one plane block as one polygon); only the rest gets rays.
     In a scene declared closed rows are closed by a symmetric scaling, see :func:`close_rows`; a row that
-    lacks more than 1 % is covered by something and keeps what it has.
+    lacks more than 1 % (and than twice its error) is covered by something and keeps what it has.
     """
     threads = workers if workers is not None else len(os.sched_getaffinity(0))
     if by not in ("patch", "surface"):
@@ -654,7 +734,12 @@ def view_factors(
     )  # fmt: skip
     with record.stage("mesh"):
         geometry = Geometry.from_scene(scene)
-        mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=False)
+        if elements is None and max_edge is None:
+            mesh = _Elements.of_polygons(geometry)
+        else:
+            mesh = _Elements.of_mesh(
+                build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=False)
+            )
         row_of, names = _names(mesh, geometry, by)
         areas = np.bincount(row_of, mesh.element_area, len(names)).astype(np.float64)
     with record.stage("prepare"):
@@ -761,8 +846,7 @@ def _all_exchanges(
     start[1:] = np.cumsum(np.bincount(r, minlength=rows) + np.bincount(c, minlength=rows))
     column = np.empty(2 * len(value), dtype=np.int32)
     data, errors = np.empty(len(column)), np.empty(len(column), dtype=np.float32)
-    order = np.argsort(r.astype(np.int64) * rows + c)
-    _symmetric_rows(r[order], c[order], value[order], error[order], start[:-1].copy(), column, data, errors)
+    _symmetric_rows(r, c, value, error, start, column, data, errors)
     if start[-1] < 2**31:
         start = start.astype(np.int32)
     exchange = scipy.sparse.csr_array((data, column, start), shape=(rows, rows))
@@ -783,17 +867,28 @@ def _scatter(r, c, value, error, dense, dense_error):
 
 
 @njit(nogil=True, cache=True)
-def _symmetric_rows(r, c, value, error, place, column, data, errors):
-    """Fill the rows of a symmetric CSR matrix, columns ascending, from pairs r < c sorted by (r, c)."""
-    # Below the diagonal first: row c gets its columns r in ascending order of r.
+def _symmetric_rows(r, c, value, error, start, column, data, errors):
+    """Fill the rows of a symmetric CSR matrix, columns ascending, from distinct pairs (r, c), by counting."""
+    rows = start.shape[0] - 1
+    count = 2 * r.shape[0]
+    # All entries by column first; then, in that order, each to the next place of its row.
+    place = start[:-1].copy()
+    order = np.empty(count, dtype=np.int64)
     for k in range(r.shape[0]):
-        p = place[c[k]]
-        column[p], data[p], errors[p] = r[k], value[k], error[k]
-        place[c[k]] = p + 1
-    for k in range(r.shape[0]):
-        p = place[r[k]]
-        column[p], data[p], errors[p] = c[k], value[k], error[k]
-        place[r[k]] = p + 1
+        order[place[r[k]]] = 2 * k
+        place[r[k]] += 1
+        order[place[c[k]]] = 2 * k + 1
+        place[c[k]] += 1
+    for i in range(rows):
+        place[i] = start[i]
+    for col in range(rows):
+        for p in range(start[col], start[col + 1]):
+            k = order[p] >> 1
+            # Entry 2 k stands in column r and row c, its mirror image the other way round.
+            row = c[k] if order[p] & 1 == 0 else r[k]
+            q = place[row]
+            column[q], data[q], errors[q] = col, value[k], error[k]
+            place[row] = q + 1
 
 
 def _finished(
@@ -804,7 +899,7 @@ def _finished(
     stated = np.asarray(spread.sum(axis=1)).ravel() / areas
     correction = 0.0
     if scene.closed:
-        covered = 1.0 - sums > np.maximum(stated, COVERED)
+        covered = 1.0 - sums > np.maximum(2.0 * np.maximum(stated, record.settings["error"]), COVERED)
         x = close_rows(exchange, np.where(covered, sums * areas, areas))
         if isinstance(exchange, np.ndarray):
             change = 0.0
@@ -817,12 +912,7 @@ def _finished(
                 exchange[rows] *= scale + 1.0
             correction = change
         else:
-            row = np.repeat(np.arange(len(areas)), np.diff(exchange.indptr))
-            scale = x[row] * x[exchange.indices]
-            moved = np.abs((scale - 1.0) * exchange.data)
-            correction = float((moved / areas[row]).max(initial=0.0))
-            spread.data[:] = np.hypot(spread.data, moved)
-            exchange.data *= scale
+            correction = _scale_rows(exchange.indptr, exchange.indices, exchange.data, spread.data, x, areas)
         record.results["covered_rows"] = int(covered.sum())
     largest = float(exchange.max()) if len(areas) else 0.0
     matrix = _times_rows(exchange, 1.0 / areas)
@@ -849,7 +939,31 @@ def _asymmetry(matrix: Matrix, areas: FloatArray) -> float:
                 worst, float(np.abs(areas[rows, None] * matrix[rows] - (areas[:, None] * matrix[:, rows]).T).max())
             )
         return worst
-    row = np.repeat(np.arange(len(areas)), np.diff(matrix.indptr))
-    # The pattern is symmetric, so the transpose as CSR has its entries in the same places.
-    back = matrix.T.tocsr().data * areas[matrix.indices]
-    return float(np.abs(matrix.data * areas[row] - back).max(initial=0.0))
+    return float(_worst_pair(matrix.indptr, matrix.indices, matrix.data, areas))
+
+
+@njit(nogil=True, cache=True)
+def _scale_rows(indptr, indices, data, errors, x, areas):
+    """Scale a symmetric CSR matrix by x on both sides, and its errors with it; largest change over its row's area."""
+    largest = 0.0
+    for i in range(areas.shape[0]):
+        for k in range(indptr[i], indptr[i + 1]):
+            moved = (x[i] * x[indices[k]] - 1.0) * data[k]
+            largest = max(largest, abs(moved) / areas[i])
+            data[k] += moved
+            errors[k] = math.sqrt(errors[k] * errors[k] + moved * moved)
+    return largest
+
+
+@njit(nogil=True, cache=True)
+def _worst_pair(indptr, indices, data, areas):
+    """Largest |A_i F_ij - A_j F_ji| of a CSR matrix with a symmetric pattern and ascending columns."""
+    place = indptr[:-1].copy()
+    worst = 0.0
+    for i in range(areas.shape[0]):
+        for k in range(indptr[i], indptr[i + 1]):
+            # Row i is met by row j's entries in ascending order of i.
+            j = indices[k]
+            worst = max(worst, abs(areas[i] * data[k] - areas[j] * data[place[j]]))
+            place[j] += 1
+    return worst
