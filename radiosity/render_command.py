@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from workbench.record import RunRecord
     from workbench.scene.model import Camera, Scene
 
-__all__ = ["render"]
+__all__ = ["elements_for", "render"]
 
 INTERRUPTED = 130
 QUICK_ERROR = 0.1
@@ -227,8 +227,8 @@ def _chosen_camera(
 # ---- from a solution ----------------------------------------------------------------------------
 
 
-def _elements_for(error: float) -> int:
-    """Elements of the solve for a picture: the gather refines what it reads, so a coarse mesh will do."""
+def elements_for(error: float) -> int:
+    """Elements of the solve for a picture of an error: the gather refines what it reads, so a coarse mesh will do."""
     return int(min(max(8.0 / error, 100), 4000))
 
 
@@ -347,7 +347,7 @@ def _solution(
         bar.set_description_str("solve")
         solution = radiosity.solve(
             scene,
-            elements=_elements_for(error),
+            elements=elements_for(error),
             tolerance=min(0.25 * error, 0.05),
             seed=seed,
             workers=workers or len(os.sched_getaffinity(0)),

@@ -42,6 +42,7 @@ from workbench.scene.model import Light, Scene, Surface
 from workbench.shadow.lights import LinearLight, Sender, lights_of_scene
 from workbench.shadow.occlusion import OcclusionEstimate, OcclusionState, Shader
 from workbench.shadow.rays import NOISE
+from workbench.shadow.sky import SkyLight
 
 __all__ = ["ComponentCount", "DiffuseEnds", "RayTally", "TraceOptions", "Traced", "Tracer"]
 
@@ -453,6 +454,7 @@ class Tracer:
         self._surface = np.append(self.geometry.polygon_surface, NO_SURFACE).astype(np.int32)
         self._all = EmbreeAccelerator(self.geometry)
         self.offset = self._all.offset
+        self._sky = SkyLight.of_scene(scene) if scene.sky is not None else None
         self._set_up_shadows()
         emitting = [surface for surface in scene.surfaces if surface.material.emission.any()]
         shining = [light for light in scene.lights if light.power.any()]
@@ -517,6 +519,12 @@ class Tracer:
         self._panes = EmbreeAccelerator(panes)
         through = self._materials.transmittance[clear]
         self._pane_transmittance = through[panes.polygon_surface]
+
+    def beyond(self, directions: FloatArray) -> FloatArray:
+        """Radiance (n or 1, bands) of the sky or the background in unit directions (n, 3). [W m-2 sr-1]"""
+        if self._sky is None or not len(directions):
+            return self.scene.background[None]
+        return self._sky.radiance(directions)
 
     @property
     def branching(self) -> int:
@@ -835,7 +843,7 @@ class _Sweep:
             self._note_surfaces(wave, found)
         count = len(found.ray)
         if count < len(radiance):
-            radiance[:] = tracer.scene.background
+            radiance[:] = tracer.beyond(wave.directions)
         if count == 0:
             return radiance
         lit, reflectance, mirrored = self._begin(found)
@@ -870,7 +878,7 @@ class _Sweep:
             found = self._hits(wave, depth)
             missed = np.ones(len(wave.sample), dtype=bool)
             missed[found.ray] = False
-            np.add.at(radiance, wave.sample[missed], throughput[missed] * tracer.scene.background)
+            np.add.at(radiance, wave.sample[missed], throughput[missed] * tracer.beyond(wave.directions[missed]))
             throughput = throughput[found.ray]
             lit, reflectance, mirrored = self._begin(found)
             leaving = np.empty_like(throughput)
