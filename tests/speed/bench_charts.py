@@ -9,10 +9,10 @@ records.  A quarter of an hour on two cores.
 from __future__ import annotations
 
 import argparse
+import subprocess
 import sys
 from pathlib import Path
 
-from radiosity.cli import main
 from radiosity.report.cost_model import fit, write_table
 from radiosity.report.speed_accuracy import read_runs
 
@@ -31,7 +31,8 @@ def run(folder: Path, only: str | None) -> None:
     for name, arguments in CHARTS.items():
         if only is None or only in name:
             print(f"== {name}", flush=True)
-            main(["chart", *arguments, "--repeats", "3", "-o", str(folder / name)], standalone_mode=False)
+            command = [sys.executable, "-c", "from radiosity.cli import main; main()", "chart", *arguments]
+            subprocess.run([*command, "--repeats", "3", "-o", str(folder / name)], check=True)
 
 
 def fitted(folder: Path) -> None:
