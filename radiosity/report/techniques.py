@@ -517,17 +517,18 @@ class Solve(Problem):
 
     def _meshed(self, name: str, method: str, values: tuple[int, ...], gather: bool) -> Technique:
         def ask(value: float, seed: int) -> Answer:
-            # Finer meshes are worth better form factors and less light left.
+            # Finer meshes are worth better form factors, less light left and a better gather: a gathered mesh
+            # of n elements is off by about 0.3 / sqrt(n).
             fine = 0.3 / math.sqrt(value)
-            options: dict[str, Any] = {"method": method, "elements": int(value)}
-            if method == "direct":
-                options["form_factor_error"] = 0.02  # finer ones cost far more than a mesh so coarse is worth
-            else:
+            options: dict[str, Any] = {
+                "method": method, "elements": int(value), "form_factor_error": min(2.0 * fine, 0.2),
+            }  # fmt: skip
+            if method != "direct":
                 options["tolerance"] = min(0.01, fine)
             solution = self._solved(options, seed)
             if not gather:
                 return Answer(self._read(solution), dict(solution.record.counters))
-            return Answer(*self._gathered(solution, min(0.02, fine), seed))
+            return Answer(*self._gathered(solution, min(0.05, fine), seed))
 
         return Technique(name, "elements", values, ask)
 
@@ -546,19 +547,19 @@ class Solve(Problem):
         return self._meshed("hierarchical", "hierarchical", (100, 400, 1600), False)
 
     def _hierarchical_gather(self) -> Technique:
-        return self._meshed("hierarchical+gather", "hierarchical", (50, 200, 800), True)
+        return self._meshed("hierarchical+gather", "hierarchical", (16, 50, 200, 800), True)
 
     def _progressive(self) -> Technique:
         return self._meshed("progressive", "progressive", (100, 400, 1600), False)
 
     def _progressive_gather(self) -> Technique:
-        return self._meshed("progressive+gather", "progressive", (50, 200, 800), True)
+        return self._meshed("progressive+gather", "progressive", (16, 50, 200, 800), True)
 
     def _direct(self) -> Technique:
         return self._meshed("direct", "direct", (50, 100, 200), False)
 
     def _direct_gather(self) -> Technique:
-        return self._meshed("direct+gather", "direct", (50, 100, 200), True)
+        return self._meshed("direct+gather", "direct", (16, 50, 100), True)
 
     def _rival(self, name: str, rival: Rival) -> Technique:
         def ask(value: float, seed: int) -> Answer:
