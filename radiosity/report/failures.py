@@ -219,6 +219,7 @@ def _shadow_entries() -> list[Failure]:
     seen = sum(point_irradiance(_rectangle(x, x + 1 / 32, -0.5, 0.5, 2.0)) for x in np.arange(16) / 16 - 0.5 + 1 / 32)
     upright = np.array([[1, 0.5, 1], [1, 0.5, -1], [1, -0.5, -1], [1, -0.5, 1.0]])
     side = np.array([[0.2, -0.1, 0.8], [0.3, -0.1, 1.2], [0.3, 0.1, 1.2], [0.2, 0.1, 0.8]])
+    glow = np.array([[1e-4, 1, 0], [1e-4, 1, 2], [1e-4, -1, 2], [1e-4, -1, 0.0]])[::-1].copy()
     box = box_surface("box", diffuse("box", 0.0), [-0.3, -0.3, 0.0], [0.3, 0.3, 0.6], omit=["-z"])
     triangles = [np.array(t, dtype=float) for t in (
         [[-0.4, -0.4, 1], [0.4, -0.4, 1], [0.4, 0.4, 1]], [[-0.4, -0.4, 1], [0.4, 0.4, 1], [-0.4, 0.4, 1]],
@@ -247,6 +248,8 @@ def _shadow_entries() -> list[Failure]:
         _shadows("light across the horizon", "grazing pyramids", "what lies below the horizon gives nothing",
                  _lit_scene([upright], [_square(0.1, 1.0, 3.0)]),
                  point_irradiance(np.array([[1, -0.5, 1], [1, -0.5, 0], [1, 0.5, 0], [1, 0.5, 1.0]]))),
+        _shadows("a step from a glowing wall", "touching patches", "samples of the wall blow up as 1 / d^2: 1e-4 away",
+                 _lit_scene([glow], [_square(0.1, 1.0, -3.0)]), point_irradiance(glow)),
         _shadows("concave light, one arm hidden", "concave lights", "planes through inner edges cut off its own arm",
                  _lit_scene([ell], [_rectangle(-0.5, 0, 0, 0.5, 1.0)]),
                  point_irradiance(_rectangle(-1, 1, -1, 0, 2.0))),
@@ -303,7 +306,7 @@ def _shadow_entries() -> list[Failure]:
 # ---- form factors ----------------------------------------------------------------------------------
 
 
-FACTOR_TECHNIQUES = ("bundle", "bundle to 1e-6", "hemicube", "hemisphere rays")
+FACTOR_TECHNIQUES = ("view factors", "bundle", "bundle to 1e-6", "hemicube", "hemisphere rays")
 OPPOSITE = 0.19982489569838746
 """Unit squares opposite each other at distance 1 (Howell C-11)."""
 
@@ -311,10 +314,17 @@ OPPOSITE = 0.19982489569838746
 def _factor(scene: Scene, technique: str) -> tuple[float, float]:
     """F from the first polygon to the second, and its stated error."""
     from radiosity.form_factors.bundle import ReceiverBundles
+    from radiosity.form_factors.matrix import view_factors
     from radiosity.patches import build_mesh
     from radiosity.report.techniques import problem_for
     from radiosity.solvers.solve import _settings
 
+    if technique == "view factors":
+        found = view_factors(scene, error=0.001, workers=1, seed=1)
+        order = np.argsort(build_mesh(scene, Geometry.from_scene(scene), split=1, cluster=False).element_polygon)
+        doubt = found.standard_error
+        spread = doubt if isinstance(doubt, np.ndarray) else doubt.toarray()
+        return float(found.dense()[order[0], order[1]]), float(spread[order[0], order[1]])
     if technique.startswith("bundle"):
         geometry = Geometry.from_scene(scene)
         mesh = build_mesh(scene, geometry, split=1, cluster=False)
@@ -328,10 +338,10 @@ def _factor(scene: Scene, technique: str) -> tuple[float, float]:
         return float(columns.factor[0, row]), float(columns.spread[0, row]) + error * abs(float(columns.factor[0, row]))
     ask = problem_for("viewfactors", scene, workers=1).technique("hemicube" if technique == "hemicube" else "rays").ask
     count = 64 if technique == "hemicube" else 16384
-    found = [float(ask(count, seed).values[0, 1]) for seed in range(4)]
+    runs = [float(ask(count, seed).values[0, 1]) for seed in range(4)]
     # A run without a hit says no more than that F is below about 3 / n; a hemicube's pixels are this coarse.
     least = 5.1e-4 if technique == "hemicube" else 3.0 / (4 * count) / STATED
-    return float(np.mean(found)), float(np.std(found, ddof=1)) / 2.0 + least
+    return float(np.mean(runs)), float(np.std(runs, ddof=1)) / 2.0 + least
 
 
 def _pair(name: str, group: str, about: str, rings: list[FloatArray], expected: float, share: float = 0.01) -> Failure:

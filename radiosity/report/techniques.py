@@ -679,7 +679,7 @@ class Pictures(Problem):
         if kind == "converged":
             found = self._aliased().ask(16, 1)
             return Reference("16 x 16 samples a pixel", found.values)
-        return _rival_reference(self, kind, 1024)
+        return _rival_reference(self, kind, 8192)
 
     def _gather(self) -> Technique:
         def ask(value: float, seed: int) -> Answer:

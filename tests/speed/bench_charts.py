@@ -23,7 +23,7 @@ CHARTS = {
     "solve-cornell": ["cornell-box", "--what", "solve", "--points", "192", "--reference", "mitsuba"],
     "solve-office": ["office", "--what", "solve", "--points", "192", "--reference", "mitsuba", "--limit", "4"],
     "render-cornell": ["cornell-box", "--what", "render"],
-    "picture-cornell": ["cornell-box", "--what", "picture", "--width", "64", "--reference", "mitsuba"],
+    "picture-cornell": ["cornell-box", "--what", "picture", "--width", "48", "--reference", "mitsuba"],
 }
 
 
