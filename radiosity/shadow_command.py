@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,8 @@ __all__ = ["shadow"]
 
 CONVERGED = 4096
 """Rays a point of the run that stands in for an exact one."""
+SAMPLED = ("adaptive", "camera", "camera-optimised", "rays", "rays+plane-vertex", "shaft")
+"""Methods whose error falls with the number of samples."""
 STATES = (("not in shadow", "#f0e442"), ("in shadow", "#3b3b58"), ("complex", "#56b4e9"))
 """The occlusion states, in their order, with colours that the colour-blind can tell apart."""
 
@@ -46,6 +49,21 @@ class _Grid(click.ParamType):
         return sides
 
 
+class _Counts(click.ParamType):
+    """One number or several in rising order, such as 4,16,64."""
+
+    name = "K,..."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        if isinstance(value, tuple):
+            return value
+        parts = str(value).split(",")
+        counts = tuple(int(part) for part in parts if re.fullmatch(r"[0-9]{1,7}", part))
+        if len(counts) < len(parts) or not 1 <= counts[0] <= counts[-1] <= 1 << 20 or sorted(set(counts)) != [*counts]:
+            self.fail(f"found {value!r}, expected numbers from 1 to {1 << 20} in rising order: 4,16,64", param, ctx)
+        return counts
+
+
 @click.command()
 @click.argument("scene")
 @click.option("--grid", type=_Grid(), help="Points on a flat surface.  [default: 32x32]")
@@ -61,11 +79,11 @@ class _Grid(click.ParamType):
 @click.option("--light", metavar="NAME", help="One light only.  [default: all]")
 @click.option(
     "--samples",
-    type=click.IntRange(1, 1 << 20),
-    default=64,
-    show_default=True,
-    metavar="K",
-    help="Rays a point and light, or pixels a picture.",
+    type=_Counts(),
+    default=(64,),
+    show_default="64",
+    metavar="K,...",
+    help="Rays a point and light, or pixels a picture; of several the errors are charted.",
 )
 @click.option(
     "--error",
@@ -86,7 +104,7 @@ def shadow(
     points_path: Path | None,
     methods: str,
     light: str | None,
-    samples: int,
+    samples: tuple[int, ...],
     error: float,
     seed: int,
     workers: int | None,
@@ -98,7 +116,8 @@ def shadow(
     SCENE is a scene file or the name of a built-in scene.  Prints a row a method: rays, intersection
     tests done and avoided, polygons checked and culled, seconds, the error against exact cuts (root
     mean square over the points, relative to their mean irradiance) and the error that the method
-    itself states.  DIR gets shadow.csv, shadow.png (irradiance, occlusion states, candidates) and
+    itself states.  Several numbers of samples give a row each, the slope at which the error falls with
+    them, and a chart of it.  DIR gets shadow.csv, shadow.png (irradiance, occlusion states, candidates) and
     record.json.
 
     Methods: adaptive, auto, camera, camera-optimised, exact, rays, rays+plane-vertex, shaft.
@@ -137,17 +156,21 @@ def shadow(
     rows, found, reference = _run(geometry, lights, sensors, names, samples, error, seed, workers, record)
     record.settings = {
         "scene": scene, "surface": surface, "points": str(points_path) if points_path else None,
-        "grid": list(grid) if grid else None, "methods": names, "light": light, "samples": samples, "error": error,
-        "seed": seed, "workers": workers,
+        "grid": list(grid) if grid else None, "methods": names, "light": light,
+        "samples": list(samples), "error": error, "seed": seed, "workers": workers,
     }  # fmt: skip
     record.choices["reference"] = reference
     title = (
         f"{loaded.name}: {len(sensors.points)} points on {sensors.name}, {len(lights)} light(s), "
         f"{geometry.polygon_count} polygons; errors against {reference}"
     )
-    result = StudyResult("shadow", title, rows, [], record, lambda figure: _draw(figure, loaded.name, sensors, found))
+    slopes = _slopes(rows)
+    notes = [f"{method}: the error falls as samples^{slope:.2f}" for method, slope in slopes.items()]
+    result = StudyResult(
+        "shadow", title, rows, notes, record, lambda figure: _draw(figure, loaded.name, sensors, found, rows, slopes)
+    )
     to_error = json_path == "-"
-    click.echo(f"{title}\n\n{format_table(rows)}", err=to_error)
+    click.echo("\n".join([title, "", format_table(rows), *notes]), err=to_error)
     if directory is not None:
         for path in write_study(result, directory):
             click.echo(str(path), err=to_error)
@@ -324,8 +347,8 @@ def surface_grid(scene: Scene, geometry: Geometry, name: str | None, shape: tupl
 
 
 def _run(
-    geometry: Geometry, lights: list[Any], sensors: Sensors, methods: list[str], samples: int, error: float, seed: int,
-    workers: int | None, record: Any,
+    geometry: Geometry, lights: list[Any], sensors: Sensors, methods: list[str], samples: tuple[int, ...], error: float,
+    seed: int, workers: int | None, record: Any,
 ) -> tuple[list[dict[str, Any]], dict[str, OcclusionEstimate], str]:  # fmt: skip
     """Rows of the table, the estimates by method, and the name of the reference."""
     import numpy as np
@@ -341,18 +364,22 @@ def _run(
         )  # fmt: skip
 
     found: dict[str, OcclusionEstimate] = {}
+    runs: list[tuple[str, int | None, OcclusionEstimate, float]] = []
     for method in dict.fromkeys(methods):
         with record.stage("load kernels"):  # and compile them on a first run: no part of a method's seconds
-            ask(method, samples, slice(0, 2))
-        with record.stage(method):
-            found[method] = ask(method, samples)
+            ask(method, samples[-1], slice(0, 2))
+        for count in samples if method in SAMPLED else samples[-1:]:
+            begin = time.perf_counter()
+            with record.stage(method):
+                found[method] = ask(method, count)
+            runs.append((method, count if method in SAMPLED else None, found[method], time.perf_counter() - begin))
     from workbench.shadow.lights import LinearLight
 
     lines = any(isinstance(light, LinearLight) for light in lights)
     if lines and geometry.polygon_transmittance.any():
         name, method, count = f"{CONVERGED} rays", "rays", CONVERGED
     else:
-        name, method, count = "exact cuts", "exact", samples
+        name, method, count = "exact cuts", "exact", 1
     if method == "exact" and "exact" in found:
         reference = found["exact"]
     else:
@@ -361,8 +388,7 @@ def _run(
     found["reference"] = reference
     mean = float(reference.irradiance.mean())
     rows: list[dict[str, Any]] = []
-    for method in dict.fromkeys(methods):
-        estimate = found[method]
+    for method, samples_here, estimate, seconds in runs:
         counted = estimate.counters
         record.counters.merge(counted)
         traced = counted["voxels_stepped"] > 0 or counted["polygon_tests"] > 0
@@ -370,13 +396,14 @@ def _run(
         rows.append(
             {
                 "method": method,
+                "samples": samples_here,
                 "rays": counted["rays"],
                 "tests": counted["polygon_tests"] if traced else None,
                 "avoided": counted["tests_avoided"] if traced else None,
                 "checks": counted["plane_vertex_checks"] + counted["shaft_tests"],
                 "culled": counted["plane_vertex_culls"] + counted["shaft_culls"],
                 "hit_rate": counted["rays_hit"] / counted["rays"] if traced and counted["rays"] else None,
-                "seconds": record.seconds[method],
+                "seconds": seconds,
                 "error": float(np.sqrt((gap**2).mean())) / mean if mean > 0 and estimate is not reference else None,
                 "stated_error": float(np.sqrt((estimate.standard_error**2).mean())) / mean if mean > 0 else None,
             }
@@ -386,11 +413,29 @@ def _run(
     return rows, found, name
 
 
+def _slopes(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Of each method with errors at several numbers of samples, the slope of the error, both logarithmic."""
+    import numpy as np
+
+    slopes = {}
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [(row["samples"], row["error"]) for row in rows if row["method"] == method and row["error"]]
+        if len(mine) > 1:
+            slopes[method] = float(np.polyfit(*np.log(np.array(mine, dtype=float)).T, 1)[0])
+    return slopes
+
+
 # ---- the figure ---------------------------------------------------------------------------------
 
 
-def _draw(figure: Figure, name: str, sensors: Sensors, found: dict[str, OcclusionEstimate]) -> None:
-    """Irradiance of the first method, states and candidates of the first that lists them, side by side."""
+def _draw(
+    figure: Figure, name: str, sensors: Sensors, found: dict[str, OcclusionEstimate], rows: list[dict[str, Any]],
+    slopes: dict[str, float],
+) -> None:  # fmt: skip
+    """Irradiance of the first method, states and candidates of the first that lists them, side by side.
+
+    Beside them, where a method ran with several numbers of samples, its errors against these.
+    """
     import numpy as np
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
@@ -405,8 +450,12 @@ def _draw(figure: Figure, name: str, sensors: Sensors, found: dict[str, Occlusio
     spread = np.ptp(sensors.flat, axis=0)
     aspect = float(min(max(spread[1] / spread[0] if spread[0] > 0 else 1.0, 0.2), 1.5))  # height over width
     wide = aspect < 0.4
-    figure.set_size_inches((8.0, 3 * (5.5 * aspect + 1.4)) if wide else (14.0, 3.6 * aspect + 1.9))
-    left, middle, right = figure.subplots(3, 1) if wide else figure.subplots(1, 3)
+    panels = 4 if slopes else 3
+    figure.set_size_inches(
+        (8.0, 3 * (5.5 * aspect + 1.4) + 4.0 * (panels - 3)) if wide else (14.0 / 3 * panels, 3.6 * aspect + 1.9)
+    )
+    axes = figure.subplots(panels, 1) if wide else figure.subplots(1, panels)
+    left, middle, right = axes[:3]
     figure.suptitle(f"{name}: {len(sensors.points)} points on {sensors.name}")
 
     picture = _show(left, sensors, first.irradiance.mean(axis=1), cmap="inferno", vmin=0.0)
@@ -436,6 +485,22 @@ def _draw(figure: Figure, name: str, sensors: Sensors, found: dict[str, Occlusio
     picture = _show(right, sensors, counts, cmap="viridis", vmin=0.0)
     figure.colorbar(picture, ax=right, shrink=0.8, label=label)
     right.set_title(f"Candidates ({listing})" if listing is not None else "Rays")
+    if slopes:
+        _chart_errors(axes[3], rows, slopes)
+
+
+def _chart_errors(axes: Any, rows: list[dict[str, Any]], slopes: dict[str, float]) -> None:
+    """Errors made (full) and stated (dashed) against samples, both logarithmic."""
+    for number, (method, slope) in enumerate(slopes.items()):
+        mine = [row for row in rows if row["method"] == method and row["error"]]
+        counts = [row["samples"] for row in mine]
+        axes.plot(counts, [row["error"] for row in mine], "os^vD*"[number % 6] + "-", color=f"C{number}",
+                  label=f"{method}, slope {slope:.2f}")  # fmt: skip
+        axes.plot(counts, [row["stated_error"] for row in mine], "--", color=f"C{number}", linewidth=1)
+    axes.set(xscale="log", yscale="log", xlabel="rays a point and light, or pixels a picture",
+             ylabel="RMS error / mean irradiance", title="Errors made (full) and stated (dashed)")  # fmt: skip
+    axes.grid(True, which="both", alpha=0.3)
+    axes.legend(fontsize="small")
 
 
 def _show(axes: Any, sensors: Sensors, values: NDArray, **style: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -79,6 +80,26 @@ def test_one_table_one_figure_one_record(scene, tmp_path):
         assert np.asarray(picture.convert("L")).std() > 10  # something is drawn
 
 
+def test_several_numbers_of_samples_give_a_row_each_and_the_slope_of_the_error(scene, tmp_path):
+    result = run(scene, "--grid", "24x20", "--method", "rays,auto", "--samples", "4,16,64,256,1024", "-o", tmp_path)
+    assert result.exit_code == 0, result.output
+    with (tmp_path / "shadow.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["method"], row["samples"]) for row in rows] == [
+        *(("rays", count) for count in ("4", "16", "64", "256", "1024")),
+        ("auto", ""),
+    ]
+    errors = [float(row["error"]) for row in rows[:5]]
+    assert errors == sorted(errors, reverse=True)
+    # A lattice cut by straight edges: about -3/4, where independent samples have -1/2.
+    notes = json.loads((tmp_path / "record.json").read_text())["results"]["notes"]
+    slope = float(re.fullmatch(r"rays: the error falls as samples\^(-[0-9.]+)", notes[0])[1])
+    assert -1.0 < slope < -0.6
+    assert notes[0] in result.stdout
+    with Image.open(tmp_path / "shadow.png") as picture:
+        assert picture.size[0] > 1500  # a fourth panel
+
+
 def test_exact_irradiance_at_points_from_a_file(scene, tmp_path):
     points = tmp_path / "points.csv"
     points.write_text("x,y,z,nx,ny,nz\n0,0,0,0,0,2\n1.5,0,0,0,0,1\n\n0,0,0,0,0,-1\n")
@@ -131,6 +152,8 @@ def test_answers_do_not_depend_on_workers(scene, tmp_path):
         (["--points", "absent.csv"], "absent.csv: cannot be read"),
         (["--points", "absent.csv", "--grid", "3x3"], "found --grid or --surface as well"),
         (["--samples", "0"], "--samples"),
+        (["--samples", "16,4"], "in rising order"),
+        (["--samples", "4,,16"], "found '4,,16', expected numbers from 1"),
         (["--error", "2"], "--error"),
         (["-o", "/proc/none"], "give another folder"),
     ],
