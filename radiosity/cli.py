@@ -429,7 +429,8 @@ def _short(value: Any) -> str:
 def reproduce(name: str, directory: Path | None, quick: bool) -> None:
     """Run an experiment of a paper again and print its figures beside ours.
 
-    NAME is camera-table-1 (hardware cameras, Table 1), woo-corner-samples, woo-table-1 or woo-tori (Woo 1993).
+    NAME is camera-table-1 (hardware cameras, Table 1), woo-corner-samples, woo-radiosity-bundles,
+    woo-table-1 or woo-tori (Woo 1993).
     DIR gets NAME.csv, NAME.png and record.json.
     """
     from workbench.study.result import format_table, write_study

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from workbench.study.result import StudyResult
 
-__all__ = ["REPRODUCTIONS", "camera_table_1", "woo_corner_samples", "woo_table_1", "woo_tori"]
+__all__ = ["REPRODUCTIONS", "camera_table_1", "woo_corner_samples", "woo_radiosity_bundles", "woo_table_1", "woo_tori"]
 
 
 def woo_tori(quick: bool) -> StudyResult:
@@ -44,9 +44,17 @@ def camera_table_1(quick: bool) -> StudyResult:
     return camera_study(width=24, height=18) if quick else camera_study()
 
 
+def woo_radiosity_bundles(quick: bool) -> StudyResult:
+    """Woo's proposal for radiosity: directional bundles from patches, each with the plane-vertex check."""
+    from radiosity.report.directional_bundles import bundles_study
+
+    return bundles_study(patches=4, total=2048, repeats=1) if quick else bundles_study()
+
+
 REPRODUCTIONS: dict[str, Callable[[bool], StudyResult]] = {
     "camera-table-1": camera_table_1,
     "woo-corner-samples": woo_corner_samples,
+    "woo-radiosity-bundles": woo_radiosity_bundles,
     "woo-table-1": woo_table_1,
     "woo-tori": woo_tori,
 }

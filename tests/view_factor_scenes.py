@@ -84,5 +84,5 @@ def room_of(triangles: int) -> Scene:
     def count(choice):
         return sum(2 * int(np.prod(_steps(face, *choice))) for _, face in _rectangles())
 
-    choices = [(edge, up) for up in np.linspace(0.5, 1.0, 6) for edge in np.geomspace(0.05, 3.0, 800)]
+    choices = [(edge, up) for up in np.linspace(0.3, 1.0, 15) for edge in np.geomspace(0.05, 3.0, 800)]
     return closed_room(*min(choices, key=lambda choice: abs(count(choice) - triangles)))

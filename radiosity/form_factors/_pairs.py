@@ -719,6 +719,14 @@ def _one_pair(
         s, t, far, goal, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, used,
         fragments, sizes, weights, sums, tally,
     )  # fmt: skip
+    if uncertain == 1.0:
+        # No point of the smaller sees the other at all (their planes cut both near an edge): look back.
+        share, uncertain = partial_share(
+            t, s, False, goal, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, used,
+            fragments, sizes, weights, sums, tally,
+        )  # fmt: skip
+        if uncertain == 1.0 and share == 0.0:
+            share, uncertain = 0.5, 0.5
     if share < 0.0:
         return value, doubt, 1
     return value * share, doubt * share + value * uncertain, 0

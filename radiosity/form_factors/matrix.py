@@ -790,7 +790,7 @@ def exchange_areas(
         If the matrix would not fit in memory.
     """
     n = mesh.element_count
-    engine = _Engine(mesh, geometry, _Care.for_error(error, n), seed)
+    engine = _Engine(_Elements.of_mesh(mesh), geometry, _Care.for_error(error, n), seed)
     require_memory(3.0 * DENSE_ENTRY * n**2, f"a matrix of {n} x {n} form factors", "ask for fewer elements")
     engine.prepare_rays()
     exchange, spread = _all_exchanges(engine, engine.pieces.owner, n, workers, record, progress)

@@ -284,3 +284,19 @@ def test_command_refuses_an_unknown_name_and_an_unwritable_folder(tmp_path):
     result = StudyResult("name", "title", [{"a": 1}], [], RunRecord("test"), lambda figure: None)
     with pytest.raises(InputError, match="give another folder"):
         write_study(result, tmp_path / "file")
+
+
+# ---- directional bundles --------------------------------------------------------------------------
+
+
+def test_bundles_study_counts():
+    from radiosity.report.directional_bundles import bundles_study
+
+    result = bundles_study(patches=3, rays=(4, 16), total=512, repeats=1)
+    for plain, checked in zip(result.rows[::2], result.rows[1::2], strict=True):
+        assert plain["same_hits"] and checked["same_hits"]
+        assert plain["rays"] == checked["rays"] == plain["bundles"] * plain["rays_a_bundle"]
+        assert plain["checks_per_bundle"] == plain["rejected_per_bundle"] == 0
+        assert 0 < checked["rejected_per_bundle"] <= checked["checks_per_bundle"]
+        avoided = checked["tests_per_ray"] + checked["tests_avoided_per_ray"]
+        assert checked["tests_per_ray"] < plain["tests_per_ray"] <= avoided * (1 + 1e-12)

@@ -27,7 +27,7 @@ def found(room):
 
 @pytest.fixture(scope="module")
 def reference(room):
-    return radiosity.view_factors(room, error=2e-5, workers=2)
+    return radiosity.view_factors(room, error=1e-4, workers=2)
 
 
 def errors_of(found):
