@@ -44,6 +44,9 @@ class Mitsuba(Rival):
     scene : Scene
     variant : str, optional
         Mitsuba's variant; ``llvm_ad_mono`` for one band and ``llvm_ad_rgb`` otherwise, bands in threes.
+    sampler : str
+        Mitsuba's sampler for irradiance at points; ``stratified`` and ``multijitter`` take square numbers of
+        samples and leave about 60 % of the noise of ``independent`` at a thousand.
 
     Raises
     ------
@@ -56,8 +59,9 @@ class Mitsuba(Rival):
     answers = frozenset({"direct", "irradiance", "picture"})
     light_kinds = frozenset({"point", "directional"})
 
-    def __init__(self, scene: Scene, variant: str | None = None) -> None:
+    def __init__(self, scene: Scene, variant: str | None = None, sampler: str = "independent") -> None:
         super().__init__(scene)
+        self.sampler = sampler
         self.variant = variant or ("llvm_ad_mono" if scene.bands == 1 else "llvm_ad_rgb")
         self._mi = _module(self.variant)
         self._triples = band_triples(scene.bands)
@@ -131,7 +135,9 @@ class Mitsuba(Rival):
 
         mi = self._mi
         count = len(points) * samples
-        sampler = mi.load_dict({"type": "independent"})
+        sampler = mi.load_dict({"type": self.sampler, "sample_count": samples})
+        if self.sampler != "independent":
+            sampler.set_samples_per_wavefront(samples)  # a wave holds all strata of each of its points
         sampler.seed(seed % (1 << 32), count)
         row = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, samples)  # one kernel for all numbers of samples
 
