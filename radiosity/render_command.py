@@ -543,6 +543,10 @@ def _render_direct(
     if loaded.camera is not None:
         camera = _chosen_camera(loaded, loaded.camera, camera_name, eye, look_at, up, fov, size, width)
         loaded = replace(loaded, camera=camera)
+    if loaded.sky is not None:
+        click.echo(
+            "note: the sky is seen but lights nothing with --direct-only; leave that out for its light", err=True
+        )
     nff = loaded.path is not None and loaded.path.suffix.lower() == ".nff"
     options = TraceOptions(
         depth=depth,
@@ -550,7 +554,7 @@ def _render_direct(
         shadow_error=shadow_error,
         bundle=bundle,
         falloff=not nff if falloff is None else falloff,
-        see_backs=not nff,
+        see_backs=False,
         seed=seed,
     )
     drawn = render_direct(

@@ -16,7 +16,7 @@ from workbench.render.pictures import PICTURES, test_picture
 from workbench.render.textures import Checker, Noise
 from workbench.render.trace import TraceOptions, Tracer
 from workbench.scene.library import diffuse, sphere_surface
-from workbench.scene.model import Light, Surface
+from workbench.scene.model import Light, Sky, Surface
 from workbench.scene.nff import load_scene
 from workbench.shadow.linear import linear_irradiance
 
@@ -318,6 +318,20 @@ def test_published_counts_of_the_standard_procedural_databases(name, facet_error
     assert tally.shadow.shot == pytest.approx(shadow_rays, rel=0.01)
     if reflected is not None:
         assert tally.reflection.shot == pytest.approx(reflected, rel=0.01)
+
+
+def test_rays_that_meet_nothing_see_the_sky_also_in_mirrors():
+    """Overcast: (1 + 2 sin) / 3 of the zenith's radiance; below the horizon the ground, 0.2 of 7 pi / 9 over pi."""
+    sky = Sky("overcast", np.array([0.2]), zenith_radiance=np.array([9.0]))
+    mirror = floor(2.0, matter=material("mirror", specular=0.5))
+    tracer = Tracer(replace(scene([mirror], background=5.0), sky=sky))
+    slant = np.array([np.sqrt(0.75), 0.0, 0.5])
+    along = np.array([[0, 0, 1.0], slant, slant * [1, 1, -1], [0, 0, -1.0]])
+    origins = np.array([[0, 0, 1.0], [0, 0, 1.0], [9, 0, 1.0], [0, 0, 1.0]])
+    expected = [9.0, 6.0, 0.2 * 7 / 9 * 9.0, 4.5]
+    np.testing.assert_allclose(tracer.trace(origins, along).radiance[:, 0], expected, rtol=1e-6)
+    ends = tracer.trace_to_diffuse(origins, along)
+    np.testing.assert_allclose(ends.radiance[:, 0], expected, rtol=1e-6)
 
 
 def test_floor_seen_from_above_is_where_the_camera_says():

@@ -11,7 +11,8 @@ surface under irradiance E sends rho E / pi, a highlight is the energy-conservin
 An emitting surface makes no highlight: reflected rays see it themselves.
 
 Departures from physics, as in the ray tracers of the papers: no Fresnel terms (mirror and
-transparent shares are constants), shadow rays pass transparent surfaces unbent.
+transparent shares are constants), shadow rays pass transparent surfaces unbent, and what is seen
+beyond all surfaces, a sky or a background, lights nothing.
 
 The tracer both records and obeys :mod:`workbench.render.atomic`: see :class:`RayTrees` and
 :class:`Guide` there.
@@ -843,7 +844,9 @@ class _Sweep:
             self._note_surfaces(wave, found)
         count = len(found.ray)
         if count < len(radiance):
-            radiance[:] = tracer.beyond(wave.directions)
+            missed = np.ones(len(radiance), dtype=bool)
+            missed[found.ray] = False
+            radiance[missed] = tracer.beyond(wave.directions[missed])
         if count == 0:
             return radiance
         lit, reflectance, mirrored = self._begin(found)
