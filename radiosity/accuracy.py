@@ -308,7 +308,8 @@ def _refine(
             "method": method,
             "elements": count,
             "tolerance": min(0.1 * finest, 0.01),
-            "form_factor_error": min(2.0 * finest, 0.02),
+            # Bundles state an error a form factor, the matrix one a row.
+            "form_factor_error": min(0.5 * finest, 0.005) if method == "matrix" else min(2.0 * finest, 0.02),
         }
         message = f"mesh {len(run.levels) + 1}, about {count} elements"
 

@@ -8,52 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radiosity.form_factors.bundle import ColumnFinder
-from radiosity.form_factors.matrix import exchange_areas
-from radiosity.solvers.progressive import LEAST_ROW_SUM, receive
+from radiosity.form_factors.matrix import close_rows, exchange_areas
+from radiosity.solvers.lamps import lamp_irradiance, lamps_of_scene
+from radiosity.solvers.progressive import receive
 from radiosity.solvers.solution import Progress, ProgressEvent, Solution
 from workbench.geometry.flat import Geometry
+from workbench.shadow.occlusion import Shader
 
-__all__ = ["balance_rows", "solve_direct", "solve_exchange", "solve_matrix"]
+__all__ = ["solve_direct", "solve_exchange", "solve_matrix"]
 
 FloatArray = NDArray[np.float64]
 
 COLUMNS_A_STEP = 32
 SOLVED_TO, MOST_STEPS = 1e-14, 2000
 """Relative residual at which the linear equations count as solved, and most steps towards it."""
-FEW_LAMPS, LAMP_SHARE = 16, 0.1
-"""Lamps up to this number, or this share of the elements, get bundles from every receiver."""
 COVERED = 0.01
 """Share of an element of a closed scene that must see nothing to count as covered (the floor under a box)."""
-
-
-def balance_rows(exchange: FloatArray, areas: FloatArray, rounds: int = 200) -> FloatArray:
-    """Scale exchange areas so that each row sums to an area, keeping reciprocity; rows of nothing stay.
-
-    The symmetric matrix S is scaled to ``x_i x_j S_ij`` with row sums ``A_i`` (cf. J. van Leersum,
-    "A method for determining a consistent set of radiation view factors", 1989; here by symmetric
-    iterative scaling, which keeps zeros and signs).
-
-    Parameters
-    ----------
-    exchange : (n, n) float
-        Symmetric exchange areas A_i F_ij of a closed scene.
-    areas : (n,) float
-        Wanted row sums: the elements' areas, without what is covered of them.
-    rounds : int
-        Most iterations; it ends once the rows agree to 1e-14.
-
-    Returns
-    -------
-    (n, n) float
-    """
-    x = np.ones(len(areas))
-    open_rows = exchange.any(axis=1) & (areas > 0)
-    for _ in range(rounds):
-        ratio = np.divide(areas, x * (exchange @ x), out=np.ones(len(areas)), where=open_rows)
-        x *= np.sqrt(ratio)
-        if np.abs(ratio - 1.0).max() < 1e-14:
-            break
-    return exchange * x * x[:, None]
 
 
 def solve_direct(solution: Solution, bundles: ColumnFinder, *, closed: bool, progress: Progress | None = None) -> None:
@@ -172,7 +142,8 @@ def solve_exchange(
         sums = exchange.sum(axis=1) / area
         covered = 1.0 - sums > np.maximum(doubt, COVERED)
         visible[covered] = sums[covered]
-        balanced = balance_rows(exchange, area * visible)
+        x = close_rows(exchange, area * visible)
+        balanced = exchange * x * x[:, None]
         record.errors["row_balance_correction"] = float(np.abs(balanced - exchange).max() / scale)
         record.results["covered_elements"] = int(covered.sum())
         exchange = balanced
@@ -203,7 +174,6 @@ def solve_exchange(
 def solve_matrix(
     solution: Solution,
     geometry: Geometry,
-    bundles: ColumnFinder,
     *,
     error: float,
     closed: bool,
@@ -213,8 +183,8 @@ def solve_matrix(
 ) -> None:
     """As :func:`solve_direct`, but with all form factors at once, reciprocal by construction.
 
-    The light of lamps, where they are few, is found more carefully, by bundles from their receivers:
-    they are far brighter than all else.  Pairs of the rest are settled in groups
+    The light of lamps, unless they have too many polygons, goes through the shadow module
+    (:mod:`radiosity.solvers.lamps`).  Pairs of the rest are settled in groups
     (:func:`radiosity.form_factors.matrix.exchange_areas`) to ``error``, the mean over the rows of the
     sum of their errors.  Ctrl-C before the end leaves the emission alone as the solution.
     """
@@ -227,14 +197,20 @@ def solve_matrix(
             progress(ProgressEvent(0, 1.0 - done, 0.0, time.perf_counter() - start, "form factors"))
 
     square = np.zeros((2, mesh.bands))
-    lamps = np.flatnonzero(mesh.emission.any(axis=1))
-    few = len(lamps) <= max(FEW_LAMPS, LAMP_SHARE * n)
+    lamps = lamps_of_scene(solution.scene, geometry)
     try:
         report(0.0)
-        if few:
+        if lamps:
             with record.stage("light of lamps"):
-                columns = bundles.columns(lamps)
-            record.counters.merge(bundles.take_counters())
+                light = lamp_irradiance(
+                    mesh,
+                    Shader(geometry, workers),
+                    lamps,
+                    record.counters,
+                    error=error,
+                    closed=closed,
+                    seed=seed,
+                )
         with record.stage("form factors"):
             exchange, spread = exchange_areas(
                 mesh, geometry, record, error=error, workers=workers, seed=seed, progress=report
@@ -242,14 +218,11 @@ def solve_matrix(
     except KeyboardInterrupt:
         return
     with record.stage("solve"):
-        if few:
-            factor = columns.factor
-            if closed:
-                sums = factor @ mesh.element_area / mesh.element_area[lamps]
-                factor = factor / np.where(sums >= LEAST_ROW_SUM, sums, 1.0)[:, None]
-            solution.unshot[lamps] -= mesh.emission[lamps]
-            receive(solution, factor, lamps, mesh.emission[lamps])
-            square += columns.mean_square.T @ mesh.emission[lamps] ** 2
+        if lamps:
+            sent = mesh.element_area[light.elements] @ mesh.emission[light.elements]
+            solution.unshot[light.elements] -= mesh.emission[light.elements]
+            receive(solution, light.irradiance, sent)
+            square[0] += light.mean_square
         area = mesh.element_area
         doubt = spread.sum(axis=1) / area
         seen = solve_exchange(solution, exchange, exchange.sum(axis=1) / area, doubt, closed=closed)
@@ -258,4 +231,3 @@ def solve_matrix(
     solution.state_irradiance_error(form_factors=square[0], visibility=square[1])
     record.errors["reciprocity"] = 0.0
     record.counters.add(shots=n)
-    record.seconds["inside embree, summed over threads"] = bundles.seconds_in_embree

@@ -188,7 +188,7 @@ class _Exchange:
     def balance(self, wanted: FloatArray, rounds: int = 100) -> None:
         """Scale rows and columns alike until the rows sum to ``wanted`` (n,); rows of nothing stay.
 
-        The symmetric scaling of :func:`radiosity.solvers.direct.balance_rows`, on links.
+        The symmetric scaling of :func:`radiosity.form_factors.matrix.close_rows`, on links.
         """
         for _ in range(rounds):
             sums = self(np.ones((len(self.area), 1)))[:, 0]

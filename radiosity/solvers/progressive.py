@@ -25,7 +25,7 @@ from radiosity.form_factors.bundle import ColumnFinder
 from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, ShootingState, Solution
 from workbench.memory import available_bytes
 
-__all__ = ["LEAST_ROW_SUM", "receive", "remaining_bound", "shoot_until"]
+__all__ = ["receive", "remaining_bound", "shoot_until"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -62,15 +62,13 @@ def remaining_bound(solution: Solution) -> float:
     return float(np.divide(coming, whole, out=np.zeros_like(coming), where=whole > 0).max(initial=0.0))
 
 
-def receive(solution: Solution, factor: FloatArray, senders: IntArray, sent: FloatArray) -> None:
-    """Carry radiosity ``sent`` (k, bands) from patches ``senders`` to all elements; keep the book."""
+def receive(solution: Solution, arriving: FloatArray, shot: FloatArray) -> None:
+    """Let irradiance ``arriving`` (n, bands) of a shot power (bands,) arrive; keep the book."""
     mesh, book = solution.mesh, solution.book
-    arriving = factor.T @ sent
     reflected = mesh.reflectance * arriving
     solution.irradiance += arriving
     solution.radiosity += reflected
     solution.unshot += reflected
-    shot = mesh.patch_area[senders] @ sent
     received = mesh.element_area @ arriving
     book.shot += shot
     book.received += received
@@ -85,7 +83,7 @@ def _shoot(solution: Solution, state: ShootingState, patches: IntArray, factor: 
     state.sent[patches] += sent
     for patch in patches:
         solution.unshot[mesh.patch_start[patch] : mesh.patch_start[patch + 1]] = 0.0
-    receive(solution, factor, patches, sent)
+    receive(solution, factor.T @ sent, mesh.patch_area[patches] @ sent)
 
 
 def _solve_rest(solution: Solution, state: ShootingState, senders: IntArray, factor: FloatArray) -> None:
@@ -103,7 +101,7 @@ def _solve_rest(solution: Solution, state: ShootingState, senders: IntArray, fac
         system = np.eye(len(senders)) - back / mesh.patch_area[senders][:, None]
         total[:, band] = np.linalg.solve(system, unshot[:, band])
     state.sent[senders] += total
-    receive(solution, factor, senders, total)
+    receive(solution, factor.T @ total, mesh.patch_area[senders] @ total)
     # All that arrived has been shot again within ``total``.
     solution.unshot[:] = 0.0
 

@@ -327,7 +327,6 @@ def solve(
             solve_matrix(
                 solution,
                 geometry,
-                finder,
                 error=error,
                 closed=scene.closed,
                 workers=count,

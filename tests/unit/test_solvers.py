@@ -14,7 +14,6 @@ import radiosity.solvers.solution as solution_module
 from radiosity.form_factors.bundle import LinkSettings, ReceiverBundles
 from radiosity.patches import build_mesh
 from radiosity.solvers import progressive
-from radiosity.solvers.direct import balance_rows
 from radiosity.solvers.progressive import remaining_bound, shoot_until
 from radiosity.solvers.solve import _start
 from workbench import memory
@@ -140,7 +139,7 @@ def test_the_energy_book_balances_at_every_step(scene):
 
 
 @pytest.mark.parametrize("bottom", [False, True])
-@pytest.mark.parametrize("method", ["direct", "progressive"])
+@pytest.mark.parametrize("method", ["direct", "matrix", "progressive"])
 def test_a_closed_scene_absorbs_what_it_emits(method, bottom):
     # Also with a floor that a box covers in part: what its patches send has nowhere else to go.
     solution = radiosity.solve(
@@ -512,21 +511,6 @@ def test_incident_light_is_reflected_and_booked():
 # Parts
 
 
-def test_balanced_rows_sum_to_the_areas_and_stay_reciprocal():
-    rng = np.random.default_rng(2)
-    areas = rng.uniform(0.5, 2.0, 12)
-    raw = rng.uniform(0.0, 1.0, (12, 12))
-    raw = (raw + raw.T) * (1 - np.eye(12))
-    raw[5], raw[:, 5] = 0.0, 0.0  # sees nothing
-    exchange = raw / raw.sum() * areas.sum()
-    balanced = balance_rows(exchange, areas)
-    others = np.arange(12) != 5
-    assert np.abs(balanced.sum(axis=1) / areas - 1)[others].max() < 1e-12
-    assert (balanced[5] == 0).all()
-    assert np.allclose(balanced, balanced.T, rtol=1e-12)
-    assert ((balanced == 0) == (exchange == 0)).all()
-
-
 def test_a_covered_emitter_gives_what_its_visible_part_gives():
     # Furnace with a box on the floor: whatever is covered, the rest glows at e / (1 - rho) = 2, and the mean of
     # a covered element is e + rho 2 v, v being the share of it that is visible.
@@ -545,7 +529,7 @@ def test_a_covered_emitter_gives_what_its_visible_part_gives():
     assert solution.book.escaped[0] == pytest.approx(0.5, abs=1e-3)
 
 
-@pytest.mark.parametrize("method", ["direct", "progressive"])
+@pytest.mark.parametrize("method", ["direct", "matrix", "progressive"])
 def test_elements_that_see_nothing_are_left_alone(method):
     # Floor under a box, and the box's own bottom: covered, they have no light and harm nobody.
     options = {"method": method, "max_edge": 0.25, "workers": 1, "tolerance": 1e-5, "form_factor_error": 0.02}
@@ -571,3 +555,22 @@ def test_row_sums_keep_to_the_stated_error_in_a_closed_room_with_an_occluder():
     assert sums["rows"] == solution.mesh.element_count > 20
     assert max(1 - sums["min"], sums["max"] - 1) <= sums["stated_error"]
     assert sums["stated_error"] < 0.05
+
+
+def test_the_matrix_solver_agrees_with_its_judge():
+    scene = standing_box(bottom=False)
+    fine = radiosity.solve(scene, method="direct", elements=150, form_factor_error=1e-3, workers=1)
+    fast = radiosity.solve(scene, method="matrix", elements=150, form_factor_error=2e-3, workers=1)
+    assert fast.mesh.element_count == fine.mesh.element_count
+    off = (fast.irradiance - fine.irradiance) / fine.irradiance.mean()
+    stated = fast.record.errors["irradiance_form_factors_rms"] + fine.record.errors["irradiance_form_factors_rms"]
+    assert np.sqrt((off**2).mean()) < min(3 * stated, 0.02)
+    assert fast.book.imbalance(fast.unshot_power) < 1e-12
+    two = radiosity.solve(scene, method="matrix", elements=150, form_factor_error=2e-3, workers=2)
+    assert (two.radiosity == fast.radiosity).all()
+
+
+def test_an_interrupted_matrix_solve_leaves_the_emission():
+    solution = radiosity.solve(cube_with_emitter(0.3, 0.6), method="matrix", elements=100, progress=Stop(1), workers=1)
+    assert solution.stopped == "interrupted" and not solution.converged
+    assert (solution.radiosity == solution.mesh.emission).all()
