@@ -421,7 +421,8 @@ def _slopes(rows: list[dict[str, Any]]) -> dict[str, float]:
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [(row["samples"], row["error"]) for row in rows if row["method"] == method and row["error"]]
         if len(mine) > 1:
-            slopes[method] = float(np.polyfit(*np.log(np.array(mine, dtype=float)).T, 1)[0])
+            samples, errors = np.log(np.array(mine, dtype=float)).T
+            slopes[method] = float(np.polyfit(samples, errors, 1)[0])
     return slopes
 
 

@@ -42,7 +42,7 @@ def _timed(work: Callable[[], np.ndarray]) -> tuple[np.ndarray, float, float]:
 
 
 def _show(name: str, error: float, wall: float, busy: float, note: str = "") -> None:
-    print(f"{name:44s} error {error:7.3%}  wall {wall:7.2f} s  processor {busy:7.2f} s  {note}", flush=True)  # noqa: T201
+    print(f"{name:44s} error {error:7.3%}  wall {wall:7.2f} s  processor {busy:7.2f} s  {note}", flush=True)
 
 
 def _ours(scene: workbench.Scene, points, normals, own, runs, mesh: tuple[int, float] | None):
@@ -126,7 +126,7 @@ def _cold(name: str, points: np.ndarray, normals: np.ndarray, elements: int | No
                 seconds[key].append(time.perf_counter() - start)
         for key, values in seconds.items():
             ratio = min(values) / min(seconds["ours"])
-            print(f"whole process, {key:10s} {min(values):7.2f} s  ({ratio:.1f} times ours)", flush=True)  # noqa: T201
+            print(f"whole process, {key:10s} {min(values):7.2f} s  ({ratio:.1f} times ours)", flush=True)
 
 
 def main() -> None:
@@ -167,7 +167,7 @@ def main() -> None:
             samples[name] = value[3]
             again = _ours(scene, points, normals, own, runs, best)  # beside the rival, whatever else the machine does
             text = f"{name} takes {value[1] / again[1]:.1f} times our wall seconds, {value[2] / again[2]:.1f} times"
-            print(f"{text} the processor's", flush=True)  # noqa: T201
+            print(f"{text} the processor's", flush=True)
     if options.cold:
         _cold(options.scene, points, normals, None if best is None else best[0], samples)
 
