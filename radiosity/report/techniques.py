@@ -520,9 +520,9 @@ class Solve(Problem):
             # Finer meshes are worth better form factors, less light left and a better gather: a gathered mesh
             # of n elements is off by about 0.3 / sqrt(n).
             fine = 0.3 / math.sqrt(value)
-            options: dict[str, Any] = {
-                "method": method, "elements": int(value), "form_factor_error": min(2.0 * fine, 0.2),
-            }  # fmt: skip
+            options: dict[str, Any] = {"method": method, "elements": int(value)}
+            if method != "hierarchical":  # which chooses better for itself
+                options["form_factor_error"] = min(2.0 * fine, 0.2)
             if method != "direct":
                 options["tolerance"] = min(0.01, fine)
             solution = self._solved(options, seed)
@@ -547,7 +547,7 @@ class Solve(Problem):
         return self._meshed("hierarchical", "hierarchical", (100, 400, 1600), False)
 
     def _hierarchical_gather(self) -> Technique:
-        return self._meshed("hierarchical+gather", "hierarchical", (16, 50, 200, 800), True)
+        return self._meshed("hierarchical+gather", "hierarchical", (100, 200, 800, 3200), True)
 
     def _progressive(self) -> Technique:
         return self._meshed("progressive", "progressive", (100, 400, 1600), False)

@@ -21,7 +21,7 @@ CHARTS = {
     "shadows-cornell": ["cornell-box", "--what", "shadows"],
     "viewfactors-l-room": ["l-room", "--what", "viewfactors"],
     "solve-cornell": ["cornell-box", "--what", "solve", "--points", "192", "--reference", "mitsuba"],
-    "solve-office": ["office", "--what", "solve", "--points", "192", "--reference", "mitsuba", "--limit", "4"],
+    "solve-office": ["office", "--what", "solve", "--points", "96", "--reference", "mitsuba", "--limit", "4"],
     "render-cornell": ["cornell-box", "--what", "render"],
     "picture-cornell": ["cornell-box", "--what", "picture", "--width", "48", "--reference", "mitsuba"],
 }
