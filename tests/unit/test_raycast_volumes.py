@@ -137,7 +137,7 @@ def balanced(words):
 
 @settings(max_examples=120, deadline=None)
 @given(st.lists(parts, min_size=4, max_size=40), st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e3, 1e6]))
-def test_volumes_drop_no_hit_of_random_scenes(tmp_path_factory, words, seed, shift):
+def test_4_12_volumes_drop_no_hit_of_random_scenes(tmp_path_factory, words, seed, shift):
     """Failure mode 4.12: nested non-uniform scales, reflections, far coordinates, rays that graze."""
     text = balanced(words).replace("world", f"world trans {shift} {-shift} {shift}", 1)
     scene = scene_of(tmp_path_factory.mktemp("sc"), text)
