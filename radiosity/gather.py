@@ -19,7 +19,7 @@ import os
 import pickle
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from radiosity import _picture_kernels as kernels
+from radiosity.element_lookup import element_gradients
 from radiosity.regather import regathered
 from radiosity.sensors import Direct, Gatherer
 from radiosity.solvers.solution import Solution
@@ -68,6 +69,8 @@ _PIXEL_BYTES = 16000
 """Memory that a pixel of a tile takes while it is drawn, edges counted."""
 DEPTH = 6
 """Reflections and refractions in a row."""
+FUZZY_DEPTH = 3
+"""The same in scenes with fuzzy reflections."""
 
 
 @dataclass(frozen=True)
@@ -150,10 +153,12 @@ class _Fragments:
 
 @dataclass
 class _Seen:
-    """What rays from the eye met: radiance (n, bands) that needs no gather, a mark (n,) by which rays
-    that saw the same sheets are alike, and fragments, of which ``ray`` tells the ray."""
+    """What rays from the eye met: radiance (n, bands) that needs no gather and the part of it without fuzzy
+    reflections, a mark (n,) by which rays that saw the same sheets are alike, and fragments, of which ``ray`` tells
+    the ray."""
 
     radiance: FloatArray
+    steady: FloatArray
     mark: NDArray[np.uint64]
     fragments: _Fragments
     ray: IntArray
@@ -191,12 +196,14 @@ class PictureGatherer:
         self.workers, self.seed = self.gatherer.workers, seed
         self.bands = solution.mesh.bands
         materials = [surface.material for surface in self.scene.surfaces]
-        fuzzy = any(m.specular.any() and math.isfinite(m.exponent) for m in materials)
+        # With a last row for rays that met nothing.
+        self._fuzzy = np.array([m.specular.any() and math.isfinite(m.exponent) for m in materials] + [False])
+        fuzzy = bool(self._fuzzy.any())
         leads_on = any(m.specular.any() or m.transmittance.any() for m in materials)
         self._tracer = Tracer(
             self.scene,
             TraceOptions(
-                depth=DEPTH if leads_on else 0,
+                depth=FUZZY_DEPTH if fuzzy else DEPTH if leads_on else 0,
                 bundle=self.options.fuzzy_rays if fuzzy else 1,
                 see_backs=self.options.see_backs,
                 seed=seed,
@@ -205,7 +212,27 @@ class PictureGatherer:
         )
         self._first = self.gatherer.shader.tracer if leads_on else None
         self._sheets = _sheets(self.geometry)
+        self._known: dict[int, int] = {}
+        self._slopes: FloatArray | None = None
         self._places = sobol(self.options.subsamples, np.random.default_rng(seed))
+
+    def _read(self, points: FloatArray, polygon: IntArray, front: NDArray[np.bool_]) -> FloatArray:
+        """Irradiance (n, bands) of the solution at points of polygons. [W m-2]"""
+        solution, lookup = self.gatherer.solution, self.gatherer.lookup
+        if self._slopes is None:
+            self._slopes = element_gradients(solution.mesh, lookup, solution.irradiance)
+        element = lookup.elements(points, polygon, front)
+        known = np.maximum(element, 0)
+        off = points - solution.mesh.element_centroid[known]
+        found = solution.irradiance[known] + np.einsum("nbk,nk->nb", self._slopes[known], off)
+        return np.where(element[:, None] >= 0, np.maximum(found, 0.0), 0.0)
+
+    def _numbered(self, code: IntArray) -> IntArray:
+        """Small numbers for the codes of sheets, the same for the same code in all tiles."""
+        distinct, place = np.unique(code, return_inverse=True)
+        for each in distinct.tolist():
+            self._known.setdefault(each, len(self._known))
+        return np.array([self._known[each] for each in distinct.tolist()], dtype=np.int64)[place.ravel()]
 
     def draw(self, rays: PinholeRays) -> Picture:
         """The whole picture at once."""
@@ -218,26 +245,38 @@ class PictureGatherer:
         """Follow rays through places of the picture to the diffuse surfaces that they see."""
         along = rays.directions(x, y)
         ends = self._tracer.trace_to_diffuse(rays.eye, along, keys=keys)
+        radiance, steady = ends.radiance.copy(), ends.radiance
+        gain = ends.throughput * ends.reflectance / math.pi
+        keep = np.arange(len(ends.ray))
         sheet = 2 * self._sheets[ends.polygon] + ~ends.front
         if self._first is not None:
-            # Behind a mirror: another sheet for each mirror and each number of reflections.
             met = self._first.closest_hit(rays.eye, along).polygon
-            mirror = np.where(met >= 0, self.geometry.polygon_surface[met], -1) + 1
-            behind = mirror[ends.ray] * (DEPTH + 1) + ends.depth
-            sheet += np.where(ends.depth > 0, behind, 0) * (2 * int(self._sheets.max(initial=0)) + 2)
+            mirror = np.where(met >= 0, self.geometry.polygon_surface[met], -1)[ends.ray]
+            read = (ends.depth > 0) & self._fuzzy[mirror]
+            if read.any() and self.options.indirect:
+                # Many rays of a lobe, each of little weight: they read the solution, as bundles do.
+                light = self._read(ends.points[read], ends.polygon[read], ends.front[read])
+                np.add.at(radiance, ends.ray[read], gain[read] * light)
+                keep = np.flatnonzero(~read)
+            # Behind a mirror: another sheet for each mirror and each number of reflections.
+            behind = np.where(ends.depth > 0, (mirror + 1) * (DEPTH + 1) + ends.depth, 0)
+            sheet = self._numbered(sheet + behind * (2 * int(self._sheets.max(initial=0)) + 2))
+        names = ("ray", "points", "normals", "facing", "surface", "polygon")
+        ends = replace(ends, **{name: getattr(ends, name)[keep] for name in names})
+        sheet, gain = sheet[keep], gain[keep]
         toward = ends.points - rays.eye
         distance = np.linalg.norm(toward, axis=1)
         cosine = np.abs(np.einsum("ij,ij->i", toward, ends.facing)) / np.maximum(distance, 1e-300)
         pixel_size = float(np.linalg.norm(rays.right))
         fragments = _Fragments(
             pixel[ends.ray], sheet, ends.polygon, x[ends.ray], y[ends.ray], ends.points, ends.normals,
-            distance * pixel_size / np.sqrt(np.maximum(cosine, 1e-3)), ends.throughput * ends.reflectance / math.pi,
+            distance * pixel_size / np.sqrt(np.maximum(cosine, 1e-3)), gain,
         )  # fmt: skip
         # What a ray saw is the sum of hashes of surfaces and sheets.
         mark = np.zeros(len(x), dtype=np.uint64)
         code = (sheet * (len(self.scene.surfaces) + 1) + ends.surface + 1).astype(np.uint64)
         np.add.at(mark, ends.ray, code * np.uint64(0x9E3779B97F4A7C15) ^ (code >> np.uint64(7)))
-        return _Seen(ends.radiance, mark, fragments, ends.ray)
+        return _Seen(radiance, steady, mark, fragments, ends.ray)
 
 
 def _sheets(geometry: Geometry) -> IntArray:
@@ -506,10 +545,10 @@ class _Tile:
         corner = self._look(across + 1e-4, along + 1e-4, np.arange(len(across)), self._keys(across, along, 0))
         at = row * (self.width + 1) + column
         same = np.ones(len(number), dtype=bool)
-        scale = middle.radiance.max(axis=1)
+        scale = middle.steady.max(axis=1)
         for place in (at, at + 1, at + self.width + 1, at + self.width + 2):
-            other = corner.radiance[place]
-            step = np.abs(other - middle.radiance).max(axis=1)
+            other = corner.steady[place]
+            step = np.abs(other - middle.steady).max(axis=1)
             same &= (corner.mark[place] == middle.mark) & (step <= STEP * np.maximum(scale, other.max(axis=1)))
         radiance[same] = middle.radiance[same]
         return middle.fragments.take(np.flatnonzero(same[middle.fragments.pixel])), np.flatnonzero(~same)
