@@ -44,6 +44,10 @@ def _rectangles():
                 yield f"box{number}{name}", face
 
 
+def _edge(name, edge, finer):
+    return edge / finer if name.startswith("box") else edge
+
+
 def _steps(face, edge, up):
     sides = np.linalg.norm(face[1] - face[0]), np.linalg.norm(face[3] - face[0])
     return [max(1, int(np.floor(side / edge + up - 1e-9))) for side in sides]
@@ -60,11 +64,14 @@ def _triangles(face, edge, up):
             yield from ([a, b, c], [a, c, d]) if (i + j) % 2 == 0 else ([a, b, d], [b, c, d])
 
 
-def closed_room(edge: float, up: float = 1.0) -> Scene:
-    """The room in triangles whose legs are about ``edge``: at most that if ``up`` is 1, the nearest number if 0.5."""
+def closed_room(edge: float, up: float = 1.0, finer: float = 1.0) -> Scene:
+    """The room in triangles whose legs are about ``edge``: at most that if ``up`` is 1, the nearest number if 0.5.
+
+    Those of the boxes are ``finer`` times shorter.
+    """
     surfaces: dict[str, list] = {}
     for name, face in _rectangles():
-        surfaces.setdefault(name, []).extend(_triangles(face, edge, up))
+        surfaces.setdefault(name, []).extend(_triangles(face, _edge(name, edge, finer), up))
     material = diffuse("paint", 0.5)
     parts = tuple(
         Surface.from_mesh(
@@ -82,7 +89,13 @@ def room_of(triangles: int) -> Scene:
     """The room in as nearly ``triangles`` triangles as its grids allow."""
 
     def count(choice):
-        return sum(2 * int(np.prod(_steps(face, *choice))) for _, face in _rectangles())
+        edge, up, finer = choice
+        return sum(2 * int(np.prod(_steps(face, _edge(name, edge, finer), up))) for name, face in _rectangles())
 
-    choices = [(edge, up) for up in np.linspace(0.3, 1.0, 15) for edge in np.geomspace(0.05, 3.0, 800)]
+    choices = [
+        (edge, up, finer)
+        for finer in (1.0, 1.1, 1.25, 1.5)
+        for up in (0.5, 0.75, 1.0)
+        for edge in np.geomspace(0.05, 3.0, 400)
+    ]
     return closed_room(*min(choices, key=lambda choice: abs(count(choice) - triangles)))

@@ -204,3 +204,21 @@ def test_too_large_a_matrix_is_refused_with_its_size(monkeypatch):
     monkeypatch.setattr("workbench.memory.available_bytes", lambda: 1000)
     with pytest.raises(MemoryForecastError, match=r"2 x 2 view factors|mesh of"):
         radiosity.view_factors(polygon_scene(*truth_squares()))
+
+
+def test_whole_polygons_are_the_undivided_mesh():
+    # Two sides, a concave polygon in pieces, a quad and a triangle: with a mesh of one element a polygon and without.
+    two = diffuse("two", 0.5)
+    two = type(two)(**{**two.__dict__, "two_sided": True})
+    sheet = Surface.from_polygons("sheet", two, [np.array([[0.3, 0.3, 0.4], [0.7, 0.3, 0.5], [0.5, 0.7, 0.45]])])
+    arrow = np.array([[0.1, 0.1, 0.7], [0.9, 0.1, 0.7], [0.5, 0.3, 0.7], [0.5, 0.9, 0.7]])
+    room = box_surface("room", diffuse("wall", 0.5), *UNIT, inward=True)
+    scene = Scene("mixed", (room, sheet, Surface.from_polygons("arrow", two, [arrow])), bands=1, closed=True)
+    whole, divided = radiosity.view_factors(scene), radiosity.view_factors(scene, elements=1)
+    assert whole.names == divided.names and "sheet (back)" in whole.names
+    assert whole.areas == pytest.approx(divided.areas)
+    assert whole.dense() == pytest.approx(divided.dense(), rel=1e-9, abs=1e-12)
+    assert np.abs(whole.row_sums - 1).max() < 5e-3
+    # The arrow's two sides see different rooms; neither sees the other or itself.
+    rows = [whole.names.index(name) for name in ("arrow", "arrow (back)")]
+    assert (whole.dense()[np.ix_(rows, rows)] == 0).all()
