@@ -61,6 +61,7 @@ from workbench.geometry.flat import Geometry
 from workbench.memory import require_memory
 from workbench.record import RunRecord
 from workbench.scene.model import Scene
+from workbench.shadow.occlusion import Shader
 from workbench.shadow.sky import SkyLight
 
 __all__ = ["solve_hierarchical"]
@@ -225,7 +226,10 @@ class _Solver:
             self.tree = Hierarchy(scene, geometry)
             self.geo = occluder_arrays(geometry, BoxTree.build(geometry))
             self.accelerator = EmbreeAccelerator(geometry, workers=workers)
-        self.lit_from_outside = bool(scene.lights) or SkyLight.of_scene(scene) is not None
+        sky = SkyLight.of_scene(scene) is not None
+        self.lit_from_outside = sky or bool(scene.lights)
+        self.shader = Shader(geometry) if sky else None
+        self._outside = {name: np.zeros((0, scene.bands)) for name in ("mean", "spread")}
         materials = [surface.material for surface in scene.surfaces]
         self.rho = np.stack([m.reflectance for m in materials])
         self.emission = np.stack([m.emission for m in materials])
@@ -505,13 +509,33 @@ class _Solver:
             self.tree.open(chosen)
             self._grown()
 
+    def incident(self, nodes: IntArray) -> FloatArray:
+        """Irradiance (k, bands) of nodes from lights without surface and from the sky."""
+        return self._from_outside("mean", incident_irradiance, nodes)
+
+    def _from_outside(self, name: str, find: Callable[..., FloatArray], nodes: IntArray) -> FloatArray:
+        """What ``find`` says of the light from outside the mesh on each node, asked once."""
+        if not self.lit_from_outside:
+            return np.zeros((len(nodes), self.scene.bands))
+        known = self._outside[name]
+        if len(known) < self.tree.node_count:
+            more = np.full((self.tree.node_count - len(known), self.scene.bands), np.nan)
+            known = self._outside[name] = np.concatenate([known, more])
+        fresh = nodes[np.isnan(known[nodes, 0])]
+        if len(fresh):
+            with self.record.stage("light from outside"):
+                known[fresh] = find(
+                    self.scene, self.tree.mesh(fresh), self.accelerator, seed=self.seed, shader=self.shader
+                )
+        return known[nodes]
+
     def refine_for_lights(self, error: float, unit: FloatArray) -> None:
         """Split leaves over which the light from outside the mesh varies by more than ``error``."""
         if not self.lit_from_outside:
             return
         fresh = self.tree.leaves()
         while len(fresh):
-            spread = incident_spread(self.scene, self.tree.mesh(fresh), self.accelerator, seed=self.seed)
+            spread = self._from_outside("spread", incident_spread, fresh)
             need = (spread / unit).max(axis=1) * self.weight[fresh]
             chosen = np.flatnonzero((need > error) & self.can_split[fresh])
             if self.max_elements is not None:
@@ -520,13 +544,11 @@ class _Solver:
                 chosen = np.sort(chosen[: max(room, 0)])
             if not len(chosen):
                 return
-            self.tree.open(fresh[chosen])
-            self._grown()
-            arrays = self.tree.arrays
             nodes = fresh[chosen]
-            fresh = np.repeat(arrays.child[nodes], arrays.children[nodes])
-            counts = arrays.children[nodes]
-            fresh = fresh + np.arange(len(fresh)) - np.repeat(np.cumsum(counts) - counts, counts)
+            self.tree.open(nodes)
+            self._grown()
+            child, counts = self.tree.arrays.child[nodes], self.tree.arrays.children[nodes]
+            fresh = np.repeat(child - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
 
     def waiting(self) -> bool:
         """Whether there are links that were dark when last looked at and are not now."""
@@ -835,8 +857,7 @@ def _rounds(solver: _Solver, link_error: float | None, tolerance: float, progres
         solver.bias *= error / before
         before = error
         try:
-            with record.stage("incident light"):
-                solver.refine_for_lights(error, unit)
+            solver.refine_for_lights(error, unit)
             with record.stage("links"):
                 solver.refine(error, report)
         except KeyboardInterrupt:
@@ -864,7 +885,7 @@ def _first_light(solver: _Solver) -> FloatArray:
     """Make the emitters bright, and what is lit from outside the mesh; a guess at the mean irradiance (bands,)."""
     tree, scene, arrays = solver.tree, solver.scene, solver.tree.arrays
     leaves = tree.leaves()
-    incident = _incident(solver, leaves)
+    incident = solver.incident(leaves)
     area, surface = arrays.area[leaves], arrays.surface[leaves]
     emission, rho = solver.emission[surface], solver.rho[surface]
     unit = area @ (emission + incident) / area.sum()
@@ -876,22 +897,13 @@ def _first_light(solver: _Solver) -> FloatArray:
     return unit
 
 
-def _incident(solver: _Solver, leaves: IntArray) -> FloatArray:
-    """Irradiance of leaves from lights without surface and from the background."""
-    scene = solver.scene
-    if not solver.lit_from_outside:
-        return np.zeros((len(leaves), scene.bands))
-    with solver.record.stage("incident light"):
-        return incident_irradiance(scene, solver.tree.mesh(leaves), solver.accelerator, seed=solver.seed)
-
-
 def _solved(solver: _Solver, *, limit: float, interrupted: bool) -> tuple[Solution, _Exchange]:
     """The solution over the links and leaves that there are."""
     tree = solver.tree
     # What waits for light carries none; what was about to be measured has its share of a measured link.
     exchange = _Exchange(tree, solver.links, solver.pool, with_unseen=interrupted)
     mesh = tree.mesh(exchange.leaves)
-    incident = _incident(solver, exchange.leaves)
+    incident = solver.incident(exchange.leaves)
     solution = Solution(
         scene=solver.scene,
         mesh=mesh,

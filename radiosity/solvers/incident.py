@@ -190,7 +190,13 @@ def _sky_by_rays(
 
 
 def incident_irradiance(
-    scene: Scene, mesh: PatchMesh, tracer: EmbreeAccelerator, *, sky_rays: int = 128, seed: int = 0
+    scene: Scene,
+    mesh: PatchMesh,
+    tracer: EmbreeAccelerator,
+    *,
+    sky_rays: int = 128,
+    seed: int = 0,
+    shader: Shader | None = None,
 ) -> FloatArray:
     """Irradiance of every element from the lights without surface and from the sky or background.
 
@@ -203,6 +209,8 @@ def incident_irradiance(
         Cosine-distributed rays a point of an element toward the sky, where its occluders are too many
         to be cut.
     seed : int
+    shader : Shader, optional
+        Over the scene's geometry, for who asks more than once.
 
     Returns
     -------
@@ -219,7 +227,7 @@ def incident_irradiance(
         for light in scene.lights:
             out[first:last] += _light_means(light, mesh, first, last, seed, tracer)[:, None] * light.power
     if sky is not None:
-        shader = Shader(Geometry.from_scene(scene))
+        shader = shader if shader is not None else Shader(Geometry.from_scene(scene))
         count = POINTS if mesh.element_count > FEW_ELEMENTS else MORE_POINTS
         step = max(1, BLOCK_RAYS // (4 * count))
         for first in range(0, mesh.element_count, step):
@@ -229,13 +237,19 @@ def incident_irradiance(
 
 
 def incident_spread(
-    scene: Scene, mesh: PatchMesh, tracer: EmbreeAccelerator, *, sky_rays: int = 128, seed: int = 0
+    scene: Scene,
+    mesh: PatchMesh,
+    tracer: EmbreeAccelerator,
+    *,
+    sky_rays: int = 128,
+    seed: int = 0,
+    shader: Shader | None = None,
 ) -> FloatArray:
     """How much what :func:`incident_irradiance` finds varies over each element.
 
     Parameters
     ----------
-    scene, mesh, tracer, sky_rays, seed
+    scene, mesh, tracer, sky_rays, seed, shader
         As there.
 
     Returns
@@ -256,7 +270,7 @@ def incident_spread(
         out[first:last] = total.std(axis=1)
     sky = SkyLight.of_scene(scene)
     if sky is not None:
-        shader = Shader(Geometry.from_scene(scene))
+        shader = shader if shader is not None else Shader(Geometry.from_scene(scene))
         for first in range(0, mesh.element_count, step):
             last = min(first + step, mesh.element_count)
             points, normals = _points(mesh, first, last, POINTS, seed)

@@ -46,46 +46,62 @@ class BoxTree:
     def build(cls, geometry: Geometry) -> BoxTree:
         """Build the tree over all convex pieces of a geometry."""
         bounds = geometry.piece_bounds
-        order = np.arange(len(bounds))
-        centre = bounds.mean(axis=1)
-        low: list[NDArray[np.float64]] = []
-        high: list[NDArray[np.float64]] = []
-        skip: list[int] = []
-        first: list[int] = []
-        count: list[int] = []
-        # Preorder with an explicit stack; (start, stop) ranges of ``order``.
-        stack = [(0, len(bounds), -1)] if len(bounds) else []
-        while stack:
-            start, stop, parent_done = stack.pop()
-            if start < 0:  # marker: the subtree that began at node ``stop`` is complete
-                skip[stop] = len(low)
-                continue
-            node = len(low)
-            inside = order[start:stop]
-            low.append(bounds[inside, 0].min(axis=0))
-            high.append(bounds[inside, 1].max(axis=0))
-            skip.append(-1)
-            first.append(start)
-            stack.append((-1, node, parent_done))
-            if stop - start <= LEAF_SIZE:
-                count.append(stop - start)
-                continue
-            count.append(0)
-            middle = (start + stop) // 2
-            axis = int(np.argmax(np.ptp(centre[inside], axis=0)))
-            # A stable sort on (centre, index): the tree does not depend on the platform's sort.
-            by_axis = inside[np.lexsort((inside, centre[inside, axis]))]
-            order[start:stop] = by_axis
-            stack.append((middle, stop, node))
-            stack.append((start, middle, node))
+        count = len(bounds)
+        order = np.arange(count)
+        low, high = np.empty((2 * count, 3)), np.empty((2 * count, 3))
+        skip, first, inside = (np.empty(2 * count, dtype=np.int64) for _ in range(3))
+        used = _split_boxes(bounds, bounds.mean(axis=1), order, low, high, skip, first, inside) if count else 0
         return cls(
-            low=np.asarray(low).reshape(-1, 3),
-            high=np.asarray(high).reshape(-1, 3),
-            skip=np.asarray(skip, dtype=np.int64),
-            first=np.asarray(first, dtype=np.int64),
-            count=np.asarray(count, dtype=np.int64),
-            order=order.astype(np.int64),
+            low[:used].copy(), high[:used].copy(), skip[:used].copy(), first[:used].copy(), inside[:used].copy(), order
         )
+
+
+@njit(nogil=True, cache=True)
+def _split_boxes(bounds, centre, order, low, high, skip, first, count):
+    """Fill the arrays of a tree (see :class:`BoxTree`) in preorder; the number of nodes."""
+    # Ranges of ``order`` yet to be made into nodes; below zero, the node whose subtree is complete.
+    stack = np.empty((256, 2), dtype=np.int64)
+    stack[0, 0], stack[0, 1] = 0, order.shape[0]
+    top = 0
+    node = 0
+    while top >= 0:
+        start, stop = stack[top, 0], stack[top, 1]
+        top -= 1
+        if start < 0:
+            skip[stop] = node
+            continue
+        axis, widest = 0, -1.0
+        for k in range(3):
+            low[node, k], high[node, k] = np.inf, -np.inf
+            least, most = np.inf, -np.inf
+            for i in range(start, stop):
+                piece = order[i]
+                low[node, k] = min(low[node, k], bounds[piece, 0, k])
+                high[node, k] = max(high[node, k], bounds[piece, 1, k])
+                least, most = min(least, centre[piece, k]), max(most, centre[piece, k])
+            if most - least > widest:
+                axis, widest = k, most - least
+        first[node] = start
+        top += 1
+        stack[top, 0], stack[top, 1] = -1, node
+        count[node] = 0
+        if stop - start <= LEAF_SIZE:
+            count[node] = stop - start
+        else:
+            # By centre, equal ones by number: the tree does not depend on the platform's sort.
+            inside = np.sort(order[start:stop])
+            keys = np.empty(stop - start)
+            for i in range(stop - start):
+                keys[i] = centre[inside[i], axis]
+            rank = np.argsort(keys, kind="mergesort")
+            for i in range(stop - start):
+                order[start + i] = inside[rank[i]]
+            middle = (start + stop) // 2
+            stack[top + 1, 0], stack[top + 1, 1] = middle, stop
+            stack[top + 2, 0], stack[top + 2, 1] = start, middle
+            top += 2
+        node += 1
+    return node
 
 
 @njit(nogil=True, cache=True)
