@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from radiosity.form_factors._links import occluder_arrays, workspace
 from radiosity.hierarchy import Hierarchy
-from radiosity.patches import PatchMesh
 from radiosity.solvers._pairs import (
     CLEAR,
     CUT,
@@ -79,20 +78,22 @@ CUT_LIMIT = 12
 """Most candidates in the pyramid of one point that are cut exactly."""
 CUT_LEVELS = 3
 """Halvings of a kept receiver in search of shadow boundaries, for its mean."""
-FINISHED = 0.25
+FINISHED = 0.5
 """Share of the link error that the exchange area itself may be off."""
-GATHERED = 0.25
-"""What an element's own detail counts where direct light is gathered: the nearby points that see it at all."""
+FALL = 0.4
+"""Power of the link error with which the sums of errors fall (seen on rooms)."""
+BETWEEN = 0.5
+GATHERED = 0.15
+"""What a receiver's detail counts where points gather for themselves: light that its elements get wrong among
+them, and detail within one element, which only nearby points see at all (both measured on rooms)."""
 COARSER = (16.0, 16.0, 4.0, 1.0)
 """Link errors of the rounds in units of the last: emitters first, then with what they lit, then finer."""
 EXACT_ELEMENTS, EXACT = 12, 1e-8
 """Up to this many elements, if no more may be made, form factors are found to this error: a second at most."""
 FIRST_ERROR, LAST_ERROR = 1e-2, 1e-7
 """Link errors between which a wanted number of elements is sought."""
-COVERED = 0.005
-"""Share of a polygon's view in a closed scene that must be missing before its elements are asked for covers."""
-COVER_RAYS = 64
-"""Rays an element that tell how much of it is covered."""
+COVER_POINTS, COVER_RAYS = (8, 16), (1, 6)
+"""Points of an element, and rays from each, that tell how much of it is covered: of all, and of doubtful ones."""
 UNEVEN = 2.0
 """What an uneven sender counts against a receiver's own detail: it shifts means, which reflection hands on."""
 PAIR_BYTES = 120
@@ -187,10 +188,12 @@ class _Exchange:
         return self.down(received) * scale
 
     def balance(self, wanted: FloatArray, rounds: int = 100) -> None:
-        """Scale rows and columns alike until the rows sum to ``wanted`` (n,); rows of nothing stay.
+        """Scale rows and columns alike until the rows sum to ``wanted`` (n,).
 
-        The symmetric scaling of :func:`radiosity.form_factors.matrix.close_rows`, on links.
+        The symmetric scaling of :func:`radiosity.form_factors.matrix.close_rows`, on links.  Rows for which
+        nothing is wanted are those of covered elements, and exchange nothing.
         """
+        self.scale[wanted <= 0.0] = 0.0
         for _ in range(rounds):
             sums = self(np.ones((len(self.area), 1)))[:, 0]
             ratio = np.divide(wanted, sums, out=np.ones_like(sums), where=(sums > 0) & (wanted > 0))
@@ -226,6 +229,8 @@ class _Solver:
             self.tree = Hierarchy(scene, geometry)
             self.geo = occluder_arrays(geometry, BoxTree.build(geometry))
             self.accelerator = EmbreeAccelerator(geometry, workers=workers)
+        self._bare = np.zeros(0)
+        self.two_sided = np.asarray([m.two_sided for m in geometry.surface_material])[geometry.polygon_surface]
         sky = SkyLight.of_scene(scene) is not None
         self.lit_from_outside = sky or bool(scene.lights)
         self.shader = Shader(geometry) if sky else None
@@ -268,7 +273,8 @@ class _Solver:
         if not self.direct_in_mesh:
             surface = arrays.surface[:n]
             reflected = np.where(surface >= 0, self.rho.max(axis=1)[np.maximum(surface, 0)], self.rho.max())
-            self.weight = share * (GATHERED * reflected)
+            # Detail between elements is light put in the wrong place; within one it is only not shown.
+            self.weight = share * reflected * np.where(arrays.opened[:n] == 1, BETWEEN, GATHERED)
         self.can_split = (arrays.opened[:n] == 1) | (arrays.children[:n] > 0) | (arrays.size[:n] > 2.0 * self.min_edge)
 
     def _grown(self) -> None:
@@ -529,6 +535,47 @@ class _Solver:
                 )
         return known[nodes]
 
+    def bare(self, leaves: IntArray) -> FloatArray:
+        """Share of each leaf, (k,), that is not covered by what stands on it."""
+        if len(self._bare) < self.tree.node_count:
+            self._bare = np.concatenate([self._bare, np.full(self.tree.node_count - len(self._bare), np.nan)])
+        fresh = leaves[np.isnan(self._bare[leaves])]
+        if len(fresh):
+            with self.record.stage("covers"):
+                self._bare[fresh] = self._find_bare(fresh)
+        return self._bare[leaves]
+
+    def _find_bare(self, nodes: IntArray) -> FloatArray:
+        """A point is covered if all its rays end at backs: under a box they end inside its sides.
+
+        One ray a point first; only where one ends at a back the others follow.
+        """
+        out = np.ones(len(nodes))
+        step = BLOCK_RAYS // COVER_RAYS[1]
+        flat = np.flatnonzero(self.tree.arrays.flat[nodes] == 1)
+        for points, rays in zip(COVER_POINTS, COVER_RAYS, strict=True):
+            asked, flat = flat, flat[:0]
+            for first in range(0, len(asked), step):
+                own = asked[first : first + step]
+                mesh = self.tree.mesh(nodes[own])
+                start = points_of_elements(mesh, np.arange(len(own)), points, self.seed)
+                normals = np.repeat(mesh.element_normal, points, axis=0)
+                # Streams are told apart by the nodes, whatever block they are in.
+                along = cosine_directions(normals, rays, [self.seed, int(nodes[own[0]]), rays])
+                start = np.repeat(start + self.accelerator.offset * normals, rays, axis=0)
+                centre, scale = self.accelerator.frame
+                hit = self.accelerator.nearest_raw(
+                    ((start - centre) * scale).astype(np.float32), (along * scale).astype(np.float32)
+                )
+                backs = (hit >= 0) & ~self.two_sided[hit]
+                backs &= np.einsum("ij,ij->i", along, self.geometry.polygon_normal[hit]) > 0
+                covered = backs.reshape(len(own), points, rays).all(axis=2)
+                out[own] = 1.0 - covered.mean(axis=1)
+                flat = np.concatenate([flat, own[covered.any(axis=1)]])
+                self.counters.add(rays=len(hit))
+            out[asked[~np.isin(asked, flat)]] = 1.0
+        return out
+
     def refine_for_lights(self, error: float, unit: FloatArray) -> None:
         """Split leaves over which the light from outside the mesh varies by more than ``error``."""
         if not self.lit_from_outside:
@@ -624,7 +671,7 @@ def _conjugate_gradients(
     return z
 
 
-def _row_targets(solver: _Solver, exchange: _Exchange, mesh: PatchMesh, closed: bool) -> FloatArray:
+def _row_targets(solver: _Solver, exchange: _Exchange, closed: bool) -> FloatArray:
     """Row sums wanted of the leaves; puts those found, and the doubt of them, into the record."""
     links, record = solver.links, solver.record
     sums = exchange(np.ones((len(exchange.area), 1)))[:, 0]
@@ -635,90 +682,56 @@ def _row_targets(solver: _Solver, exchange: _Exchange, mesh: PatchMesh, closed: 
     off = np.asarray(np.bincount(a, np.where(known, links.doubt, 0.0), n), dtype=np.float64)
     off += np.bincount(b, np.where(other, links.doubt, 0.0), n)
     off /= area
-    # The mean over a node is off by the doubts of its links, a leaf's own row by their detail, too.
+    # A leaf's own row is off by the doubts of links and by their detail.
     detail = np.bincount(a, np.where(known, links.vary_a, 0.0), n) + np.bincount(
         b, np.where(other, links.vary_b, 0.0), n
     )
-    stated = exchange.down(np.column_stack([off, off + detail]))
+    stated = exchange.down((off + detail)[:, None])[:, 0]
     record.errors["row_sum"] = {
         "min": float(sums.min()),
         "mean": float(np.average(sums, weights=exchange.area)),
         "max": float(sums.max()),
-        "stated_error": float(stated[:, 1].max()),
+        "stated_error": float(stated.max()),
         "rows": len(sums),
     }
-    if not closed:
-        # Rows above 1 are errors as those below are; cutting only the former would lose light.
-        return np.minimum(sums, 1.0) if sums.max() * solver.rho.max() >= 1.0 else sums
-    # A polygon that sees too little as a whole may be covered in part (the floor under a box).
-    key = np.where(mesh.element_polygon >= 0, 2 * mesh.element_polygon + (mesh.element_side > 0), -1)
-    _, place = np.unique(key, return_inverse=True)
-    weight = np.bincount(place, exchange.area)
-    seen = np.bincount(place, exchange.area * sums) / weight
-    doubt = np.bincount(place, exchange.area * stated[:, 0]) / weight
-    asked = np.flatnonzero((1.0 - seen > np.maximum(doubt, COVERED))[place] & (mesh.element_polygon >= 0))
-    wanted = np.ones(len(sums))
-    wanted[asked] = _visible_shares(solver, mesh, asked)
-    wanted[sums <= 0.0] = 0.0
-    record.results["covered_elements"] = int((wanted < 1.0).sum())
-    return wanted
-
-
-def _visible_shares(solver: _Solver, mesh: PatchMesh, chosen: IntArray) -> FloatArray:
-    """Share of each chosen element's view, (k,), that ends at a front: in a closed scene all but what is covered.
-
-    Rays from under a box end at the backs of its sides.
-    """
-    tracer, geometry = solver.accelerator, solver.geometry
-    two_sided = np.asarray([m.two_sided for m in geometry.surface_material])[geometry.polygon_surface]
-    out = np.empty(len(chosen))
-    step = BLOCK_RAYS // COVER_RAYS
-    centre, scale = tracer.frame
-    for first in range(0, len(chosen), step):
-        own = chosen[first : first + step]
-        origins = points_of_elements(mesh, own, COVER_RAYS, solver.seed)
-        normals = mesh.element_normal[own]
-        directions = cosine_directions(normals, COVER_RAYS, [solver.seed, first])
-        origins += tracer.offset * np.repeat(normals, COVER_RAYS, axis=0)
-        hit = tracer.nearest_raw(
-            ((origins - centre) * scale).astype(np.float32), (directions * scale).astype(np.float32)
-        )
-        facing = np.einsum("ij,ij->i", directions, geometry.polygon_normal[hit]) < 0
-        out[first : first + step] = ((hit >= 0) & (facing | two_sided[hit])).reshape(-1, COVER_RAYS).mean(axis=1)
-        solver.counters.add(rays=len(hit))
-    return out
+    bare = solver.bare(exchange.leaves)
+    if closed:
+        return np.where(sums > 0.0, bare, 0.0)
+    # Rows above 1 are errors as those below are; cutting only the former would lose light.
+    most = 1.0 if sums.max() * solver.rho.max() >= 1.0 else np.inf
+    return np.minimum(sums, np.where((bare > 0.0) & (bare < 1.0), bare, most))
 
 
 def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, limit: float) -> None:
     """Solve for the leaves over the links there are; fills the solution and its energy book."""
     mesh, book = solution.mesh, solution.book
     area = exchange.area
-    # Rows are whole only once all links that carry light are there.
-    closed = solver.scene.closed and not solver.waiting()
+    bare = solver.bare(exchange.leaves)
     if exchange.wanted is None:
-        exchange.wanted = _row_targets(solver, exchange, mesh, closed)
+        # Rows are whole only once all links that carry light are there.
+        exchange.wanted = _row_targets(solver, exchange, solver.scene.closed and not solver.waiting())
         exchange.balance(exchange.wanted)
-    wanted = exchange.wanted
-    visible = np.where(wanted > 0, wanted, 1.0)[:, None] if closed else np.ones((len(area), 1))
+    bare = np.where(bare > 0, bare, 1.0)[:, None]
     incident = solution.direct_irradiance
-    sent = mesh.emission + mesh.reflectance * incident / visible
-    back = mesh.reflectance / visible
+    sent = mesh.emission + mesh.reflectance * incident
+    back = mesh.reflectance / bare
     root = np.sqrt(back)
-    # E = K (s + R E) with K symmetric: z = sqrt(R) E solves (1 - sqrt(R) K sqrt(R)) z = sqrt(R) K s.
+    # Of an element that is covered in part all values are those of its bare part, of share v, which alone
+    # exchanges light.  E = (K / v) (s + R E) with K symmetric: with R' = R / v, z = sqrt(R') v E solves
+    # (1 - sqrt(R') K sqrt(R')) z = sqrt(R') K s.
     right = root * exchange(sent)
-    start = root * (solution.irradiance - incident)
+    start = root * bare * (solution.irradiance - incident)
     z = _conjugate_gradients(lambda v: v - root * exchange(root * v), right, start, area, limit)
     seen = sent + root * z
     arriving = exchange(seen)
-    solution.irradiance = incident + arriving
+    solution.irradiance = incident + arriving / bare
     solution.radiosity = mesh.emission + mesh.reflectance * solution.irradiance
-    # What leaves, as a mean over the element, against what was sent of it: the residual is yet unshot.
-    shot = seen * visible + mesh.emission * (1.0 - visible)
-    solution.unshot = solution.radiosity - shot
-    book.emitted = area @ (mesh.emission + incident)
-    book.shot = area @ shot
-    book.received = area @ (incident + arriving)
-    book.absorbed = area @ ((1.0 - mesh.reflectance) * (incident + arriving))
+    # What was sent of what leaves: the rest, a residual, is yet unshot.
+    solution.unshot = bare * (solution.radiosity - seen)
+    book.emitted = area @ (mesh.emission + bare * incident)
+    book.shot = area @ (bare * seen + (1.0 - bare) * mesh.emission)
+    book.received = area @ (bare * incident + arriving)
+    book.absorbed = area @ ((1.0 - mesh.reflectance) * (bare * incident + arriving))
     book.escaped = book.shot - area @ arriving
 
 
@@ -779,7 +792,8 @@ def solve_hierarchical(
     Returns
     -------
     Solution
-        Its elements are the leaves of the tree; clusters of small facets may be among them.
+        Its elements are the leaves of the tree; clusters of small facets may be among them.  Of an
+        element that is covered in part (the floor under a box) the values are those of the bare part.
 
     Raises
     ------
@@ -853,8 +867,9 @@ def _rounds(solver: _Solver, link_error: float | None, tolerance: float, progres
     before = math.inf
     for error in _errors_of_rounds(solver, link_error):
         # What the sums of errors will be after this round, about.
-        solver.detail *= error / before
-        solver.bias *= error / before
+        fall = (error / before) ** FALL
+        solver.detail *= fall
+        solver.bias *= fall
         before = error
         try:
             solver.refine_for_lights(error, unit)
@@ -903,7 +918,8 @@ def _solved(solver: _Solver, *, limit: float, interrupted: bool) -> tuple[Soluti
     # What waits for light carries none; what was about to be measured has its share of a measured link.
     exchange = _Exchange(tree, solver.links, solver.pool, with_unseen=interrupted)
     mesh = tree.mesh(exchange.leaves)
-    incident = solver.incident(exchange.leaves)
+    bare = solver.bare(exchange.leaves)[:, None]
+    incident = np.divide(solver.incident(exchange.leaves), bare, out=np.zeros((len(bare), mesh.bands)), where=bare > 0)
     solution = Solution(
         scene=solver.scene,
         mesh=mesh,

@@ -122,11 +122,10 @@ def test_a_furnace_glows_alike_everywhere(rho, scene):
     solution = solve(furnace, link_error=0.01, tolerance=1e-8)
     mesh = solution.mesh
     lit = solution.irradiance[:, 0] > 0.0
-    if scene == "box":
-        # The floor under the box sees nothing, and what is covered in part has a mean of both.
-        lit &= np.abs(mesh.element_centroid[:, 2]) > 1e-9
-    assert mesh.element_area[lit].sum() > 0.6 * mesh.element_area.sum()
-    assert np.abs(solution.radiosity[lit, 0] * (1 - rho) - 1).max() < (1e-6 if scene != "box" else 5e-3)
+    # The floor under the box sees nothing; what is covered in part has the value of its bare part.
+    assert lit.all() or scene == "box"
+    assert mesh.element_area[lit].sum() > 0.97 * mesh.element_area.sum()
+    assert np.abs(solution.radiosity[lit, 0] * (1 - rho) - 1).max() < 1e-6
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -159,8 +158,10 @@ def test_it_agrees_with_the_direct_solver_on_the_same_elements(scene):
     )
     order, wanted = (np.lexsort(np.round(s.mesh.element_centroid, 6).T) for s in (solution, judge))
     assert np.allclose(solution.mesh.element_centroid[order], judge.mesh.element_centroid[wanted], atol=1e-9)
-    ratio = solution.irradiance[order, 0] - judge.irradiance[wanted, 0]
-    assert np.sqrt(np.average(ratio**2, weights=judge.mesh.element_area[wanted])) < 0.01 * judge.irradiance.mean()
+    # Where the box covers a part the judge gives the mean over all of an element, not over its bare part.
+    whole = np.abs(judge.mesh.element_centroid[wanted, 2]) > 1e-9
+    off = (solution.irradiance[order, 0] - judge.irradiance[wanted, 0])[whole]
+    assert np.sqrt((off**2).mean()) < (1e-4 if scene == "cube" else 0.01) * judge.irradiance.mean()
 
 
 def test_the_answer_does_not_depend_on_the_number_of_workers():
