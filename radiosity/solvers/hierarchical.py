@@ -92,6 +92,8 @@ EXACT_ELEMENTS, EXACT = 12, 1e-8
 """Up to this many elements, if no more may be made, form factors are found to this error: a second at most."""
 FIRST_ERROR, LAST_ERROR = 1e-2, 1e-7
 """Link errors between which a wanted number of elements is sought."""
+LEAST_LOOSE, LOOSE_ROUNDS = 0.02, 20
+"""Least share of a link that row balancing may scale, and rounds before everything is scaled."""
 COVER_POINTS, COVER_RAYS = (8, 16), (1, 6)
 """Points of an element, and rays from each, that tell how much of it is covered: of all, and of doubtful ones."""
 UNEVEN = 2.0
@@ -143,20 +145,31 @@ class _Links:
 
 
 class _Exchange:
-    """The operator from radiosity of the leaves to their irradiance, over all links."""
+    """The operator from radiosity of the leaves to their irradiance, over all links.
+
+    Of each link a share is firm, and the rest, as much as its form factor varies over its ends, is loose:
+    rows are balanced by scaling what is loose, so that the link from a lamp, which is known well, does
+    not pay for a coarse one.
+    """
 
     def __init__(self, tree: Hierarchy, links: _Links, pool: ThreadPoolExecutor, *, with_unseen: bool = False) -> None:
         self.tree, self.pool = tree, pool
         self.leaves = tree.leaves()
         self.area = tree.arrays.area[self.leaves]
         self.scale = np.ones(len(self.leaves))
+        self.loose_scale = np.ones(len(self.leaves))
         self.wanted: FloatArray | None = None
-        n, m = tree.node_count, len(links)
-        self.start = np.zeros(n + 1, dtype=np.int64)
-        self.column = np.zeros(2 * m, dtype=np.int32)
-        self.factor = np.zeros(2 * m)
-        exchange = links.exchange if with_unseen else np.where(links.state > 0, links.exchange, 0.0)
-        sort_links(links.a, links.b, exchange, tree.arrays.area, self.start, self.column, self.factor)
+        self.links = links
+        self.exchange = links.exchange if with_unseen else np.where(links.state > 0, links.exchange, 0.0)
+        self.start = np.zeros(tree.node_count + 1, dtype=np.int64)
+        self.column = np.zeros(2 * len(links), dtype=np.int32)
+        self.firm = self._sorted(self.exchange)
+        self.loose: FloatArray | None = None
+
+    def _sorted(self, exchange: FloatArray) -> FloatArray:
+        links, factor = self.links, np.zeros(len(self.column))
+        sort_links(links.a, links.b, exchange, self.tree.arrays.area, self.start, self.column, factor)
+        return factor
 
     def up(self, values: FloatArray) -> FloatArray:
         """Means of leaf values (n, bands) for all nodes."""
@@ -172,30 +185,48 @@ class _Exchange:
         push(nodes, self.tree.node_count, arrays.opened, arrays.child, arrays.children)
         return nodes[self.leaves]
 
-    def __call__(self, values: FloatArray) -> FloatArray:
-        scale = self.scale[:, None]
-        nodes = self.up(values * scale)
+    def _cross(self, factor: FloatArray, values: FloatArray) -> FloatArray:
+        """What ``values`` (n, bands) of the leaves bring to the leaves over links of these form factors."""
+        nodes = self.up(values)
         received = np.empty_like(nodes)
-        blocks = range(0, len(nodes), ROWS)
-        list(
-            self.pool.map(
-                lambda i: gather(
-                    i, min(i + ROWS, len(nodes)), self.start, self.column, self.factor, nodes, received
-                ),
-                blocks,
-            )
-        )  # fmt: skip
-        return self.down(received) * scale
 
-    def balance(self, wanted: FloatArray, rounds: int = 100) -> None:
+        def rows(first: int) -> None:
+            gather(first, min(first + ROWS, len(nodes)), self.start, self.column, factor, nodes, received)
+
+        list(self.pool.map(rows, range(0, len(nodes), ROWS)))
+        return self.down(received)
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        scaled = values * self.scale[:, None]
+        received = self._cross(self.firm, scaled)
+        if self.loose is not None:
+            loose = self.loose_scale[:, None]
+            received += loose * self._cross(self.loose, scaled * loose)
+        return received * self.scale[:, None]
+
+    def balance(self, wanted: FloatArray) -> None:
         """Scale rows and columns alike until the rows sum to ``wanted`` (n,).
 
-        The symmetric scaling of :func:`radiosity.form_factors.matrix.close_rows`, on links.  Rows for which
-        nothing is wanted are those of covered elements, and exchange nothing.
+        The symmetric scaling of :func:`radiosity.form_factors.matrix.close_rows`, first on what is loose; on
+        everything where that does not do.  Rows for which nothing is wanted are those of covered
+        elements, and exchange nothing.
         """
+        links, area = self.links, self.tree.arrays.area
+        off = np.maximum(np.maximum(links.vary_a * area[links.a], links.vary_b * area[links.b]), links.doubt)
+        share = np.divide(off, self.exchange, out=np.ones_like(self.exchange), where=self.exchange > 0)
+        share = np.clip(share, LEAST_LOOSE, 1.0)
+        self.loose = self._sorted(self.exchange * share)
+        self.firm = self._sorted(self.exchange * (1.0 - share))
         self.scale[wanted <= 0.0] = 0.0
-        for _ in range(rounds):
-            sums = self(np.ones((len(self.area), 1)))[:, 0]
+        one = np.ones((len(self.area), 1))
+        firm = self.scale * self._cross(self.firm, one * self.scale[:, None])[:, 0]
+        left = np.maximum(wanted - firm, LEAST_LOOSE * wanted)
+        for _ in range(LOOSE_ROUNDS):
+            moved = self.scale * self.loose_scale
+            loose = moved * self._cross(self.loose, moved[:, None])[:, 0]
+            self.loose_scale *= np.sqrt(np.divide(left, loose, out=np.ones_like(left), where=loose > 0))
+        for _ in range(100):
+            sums = self(one)[:, 0]
             ratio = np.divide(wanted, sums, out=np.ones_like(sums), where=(sums > 0) & (wanted > 0))
             if np.abs(ratio - 1.0).max(initial=0.0) < 1e-13:
                 break
@@ -247,6 +278,7 @@ class _Solver:
         self.total_area = float(self.tree.arrays.area[0])
         n = self.tree.node_count
         self.bright = np.zeros(n)
+        self.contrast = self.bright
         self.uneven = np.zeros(n)
         self.detail = np.zeros(n)
         self.bias = np.zeros(n)
@@ -284,6 +316,7 @@ class _Solver:
             parent = self.tree.arrays.parent[old:n]
             # Parents come first: a cell's parent may itself be new, but never within one call of ``open``.
             self.bright = np.concatenate([self.bright, self.bright[parent]])
+            self.contrast = np.concatenate([self.contrast, self.contrast[parent]])
             self.uneven = np.concatenate([self.uneven, np.zeros(n - old)])
             self.detail = np.concatenate([self.detail, self.detail[parent]])
             self.bias = np.concatenate([self.bias, self.bias[parent]])
@@ -363,7 +396,7 @@ class _Solver:
         verdict, need = np.empty(len(pairs), dtype=np.int8), np.empty(len(pairs))
         judge(
             pairs.a, pairs.b, pairs.vary_a, pairs.vary_b, pairs.state, self.tree.arrays.area, self.tree.arrays.flat,
-            self.tree.arrays.size, self.bright, self.uneven, self.detail, self.bias, self.weight, self.plain,
+            self.tree.arrays.size, self.contrast, self.uneven, self.detail, self.bias, self.weight, self.plain,
             self.can_split, error, verdict, need,
         )  # fmt: skip
         return verdict, need
@@ -372,7 +405,7 @@ class _Solver:
         """Bring kept pairs to the accuracy that the link error asks for."""
         allowed = np.empty(len(kept))
         tolerances(
-            kept, pairs.a, pairs.b, pairs.exchange, self.tree.arrays.area, self.bright, self.plain, self.relative,
+            kept, pairs.a, pairs.b, pairs.exchange, self.tree.arrays.area, self.contrast, self.plain, self.relative,
             FINISHED * error, allowed,
         )  # fmt: skip
 
@@ -608,6 +641,11 @@ class _Solver:
         mean = exchange.up(relative)
         square = exchange.up(relative**2)
         self.bright = mean.max(axis=1)
+        self.contrast = self.bright
+        if self.scene.closed and not self.waiting():
+            # In balanced rows a form factor that is too large takes from all others: toward the dark, too, it
+            # puts light in the wrong place.
+            self.contrast = np.maximum(self.bright, float(relative.mean(axis=1) @ exchange.area) / self.total_area)
         self.uneven = np.empty(len(mean))
         deviations(square, mean, self.uneven)
         self.uneven *= UNEVEN
@@ -620,7 +658,7 @@ class _Solver:
         either sign, add in squares.  Keeps the first two as means for every node.
         """
         links, n = self.links, self.tree.node_count
-        area, bright, uneven = self.tree.arrays.area, self.bright, self.uneven
+        area, bright, uneven = self.tree.arrays.area, self.contrast, self.uneven
         a, b = links.a, links.b
         two = np.where(a == b, 0.0, 1.0)  # a link of a node with itself receives once
 
@@ -671,8 +709,8 @@ def _conjugate_gradients(
     return z
 
 
-def _row_targets(solver: _Solver, exchange: _Exchange, closed: bool) -> FloatArray:
-    """Row sums wanted of the leaves; puts those found, and the doubt of them, into the record."""
+def _row_targets(solver: _Solver, exchange: _Exchange, closed: bool) -> tuple[FloatArray, FloatArray]:
+    """Row sums wanted of the leaves, and those found; puts the latter and their doubt into the record."""
     links, record = solver.links, solver.record
     sums = exchange(np.ones((len(exchange.area), 1)))[:, 0]
     n = exchange.tree.node_count
@@ -696,10 +734,10 @@ def _row_targets(solver: _Solver, exchange: _Exchange, closed: bool) -> FloatArr
     }
     bare = solver.bare(exchange.leaves)
     if closed:
-        return np.where(sums > 0.0, bare, 0.0)
+        return np.where(sums > 0.0, bare, 0.0), sums
     # Rows above 1 are errors as those below are; cutting only the former would lose light.
     most = 1.0 if sums.max() * solver.rho.max() >= 1.0 else np.inf
-    return np.minimum(sums, np.where((bare > 0.0) & (bare < 1.0), bare, most))
+    return np.minimum(sums, np.where((bare > 0.0) & (bare < 1.0), bare, most)), sums
 
 
 def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, limit: float) -> None:
@@ -709,8 +747,10 @@ def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, li
     bare = solver.bare(exchange.leaves)
     if exchange.wanted is None:
         # Rows are whole only once all links that carry light are there.
-        exchange.wanted = _row_targets(solver, exchange, solver.scene.closed and not solver.waiting())
-        exchange.balance(exchange.wanted)
+        closed = solver.scene.closed and not solver.waiting()
+        exchange.wanted, found = _row_targets(solver, exchange, closed)
+        if closed or (exchange.wanted < found).any():
+            exchange.balance(exchange.wanted)
     bare = np.where(bare > 0, bare, 1.0)[:, None]
     incident = solution.direct_irradiance
     sent = mesh.emission + mesh.reflectance * incident
