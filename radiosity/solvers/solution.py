@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radiosity.interpolation import corner_values
+from radiosity.interpolation import conforming_rings, corner_values
 from radiosity.patches import PatchMesh
 from workbench.counters import Counters
 from workbench.errors import InputError
@@ -229,21 +229,33 @@ class Solution:
         gatherer = Gatherer(self, workers=workers, seed=seed)
         return gatherer.irradiance(points, normals, own_polygon=own_polygon, error=error, rays=rays)
 
-    def to_pyvista(self) -> pyvista.PolyData:
+    def to_pyvista(self, *, conforming: bool = False) -> pyvista.PolyData:
         """The mesh with its arrays, for pyvista.
 
         Cell arrays ``radiosity_W_m2``, ``irradiance_W_m2``, ``emission_W_m2``, ``unshot_W_m2``,
         ``reflectance``, ``surface_id``, ``patch_id``, ``element_id``; point array
         ``radiosity_W_m2``, interpolated; field data ``surface_names``.
+
+        Parameters
+        ----------
+        conforming : bool
+            Cut elements into triangles that meet corner to corner: where small elements lie beside a large
+            one, shading by the points then shows no cracks.
         """
         import pyvista
 
         mesh = self.mesh
-        counts = np.diff(mesh.piece_start)
-        # Each ring as (count, corner, corner, ...), the layout of VTK's cell array.
-        cells = np.insert(np.arange(len(mesh.corners)), mesh.piece_start[:-1], counts)
-        poly = pyvista.PolyData(mesh.corners, faces=cells)
         owner = mesh.piece_element
+        points, at_points = mesh.corners, self.vertex_radiosity()
+        if conforming:
+            points, at_points, triangles, piece = self._triangles(at_points)
+            cells = np.insert(triangles, 0, 3, axis=1).ravel()
+            owner = owner[piece]
+        else:
+            counts = np.diff(mesh.piece_start)
+            # Each ring as (count, corner, corner, ...), the layout of VTK's cell array.
+            cells = np.insert(np.arange(len(mesh.corners)), mesh.piece_start[:-1], counts)
+        poly = pyvista.PolyData(points, faces=cells)
         for name, values in (
             ("radiosity_W_m2", self.radiosity),
             ("irradiance_W_m2", self.irradiance),
@@ -255,9 +267,41 @@ class Solution:
             ("element_id", np.arange(mesh.element_count)),
         ):
             poly.cell_data[name] = _column(values[owner])
-        poly.point_data["radiosity_W_m2"] = _column(self.vertex_radiosity())
+        poly.point_data["radiosity_W_m2"] = _column(at_points)
         poly.field_data["surface_names"] = np.asarray([s.name for s in self.scene.surfaces])
         return poly
+
+    def _triangles(self, at_corners: FloatArray) -> tuple[FloatArray, FloatArray, NDArray, NDArray]:
+        """Points, their values, triangles (t, 3) that meet corner to corner, and the piece of each."""
+        mesh = self.mesh
+        points, starts, edge = conforming_rings(mesh)
+        counts = np.diff(starts)
+        ring = np.repeat(np.arange(len(counts)), counts)
+        # A corner in the middle of an edge gets the mean of the edge's ends, on both sides of it alike.
+        after = np.arange(1, len(mesh.corners) + 1)
+        after[mesh.piece_start[1:] - 1] = mesh.piece_start[:-1]
+        length = np.linalg.norm(mesh.corners[after] - mesh.corners, axis=1)[edge]
+        t = np.linalg.norm(points - mesh.corners[edge], axis=1) / np.where(length > 0, length, 1.0)
+        values = at_corners[edge] + t[:, None] * (at_corners[after[edge]] - at_corners[edge])
+        key = np.unique(np.column_stack([points, mesh.element_surface[mesh.piece_element[ring]]]), axis=0,
+                        return_inverse=True)[1].reshape(-1)  # fmt: skip
+        inside = np.column_stack([np.bincount(ring, points[:, k], len(counts)) for k in range(3)]) / counts[:, None]
+        hanging = t > 0
+        # Both sides of an edge must agree: what hangs on the longer edge decides.
+        chosen = np.full(key.max() + 1, -1)
+        chosen[key[hanging]] = np.flatnonzero(hanging)
+        values = np.where((chosen[key] >= 0)[:, None], values[chosen[key]], values)
+        centre = np.column_stack([np.bincount(ring, v, len(counts)) for v in values.T]) / counts[:, None]
+        here = np.arange(len(points))
+        following = here + 1
+        following[starts[1:] - 1] = starts[:-1]
+        fans = np.column_stack([here, following, len(points) + ring])
+        # A triangle with nothing on its edges stays one.
+        whole = np.flatnonzero(counts == 3)
+        keep = counts[ring] != 3
+        triangles = np.concatenate([fans[keep], starts[whole, None] + np.arange(3)])
+        piece = np.concatenate([ring[keep], whole])
+        return np.concatenate([points, inside]), np.concatenate([values, centre]), triangles, piece
 
     def save(self, directory: str | Path) -> None:
         """Write ``solution.npz``, ``solution.vtp`` and ``record.json``, each whole or not at all."""

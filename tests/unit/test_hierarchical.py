@@ -226,6 +226,33 @@ def test_leaving_direct_light_to_points_makes_fewer_elements():
     assert mean == pytest.approx(np.average(shown.irradiance[own, 0], weights=shown.mesh.element_area[own]), rel=0.02)
 
 
+def test_the_conforming_export_has_no_t_junctions():
+    solution = solve(sheet_over_floor(0.5), link_error=2e-3)
+    poly = solution.to_pyvista(conforming=True)
+    assert poly.n_cells > solution.mesh.element_count
+    assert poly.area == pytest.approx(solution.mesh.element_area.sum(), rel=1e-6)
+    # Inside the floor every edge belongs to two triangles; only its rim has edges of one.
+    floor = (
+        poly.extract_cells(np.flatnonzero(poly.cell_data["surface_id"] == 0)).extract_surface().clean(tolerance=1e-9)
+    )
+    rim = floor.extract_feature_edges(
+        boundary_edges=True, non_manifold_edges=True, feature_edges=False, manifold_edges=False
+    )
+    assert np.allclose(np.abs(rim.points[:, :2]).max(axis=1), 2.0)
+    cracked = solution.to_pyvista()
+    cracked = cracked.extract_cells(np.flatnonzero(cracked.cell_data["surface_id"] == 0)).extract_surface().clean()
+    inner = cracked.extract_feature_edges(
+        boundary_edges=True, non_manifold_edges=False, feature_edges=False, manifold_edges=False
+    )
+    assert (np.abs(inner.points[:, :2]).max(axis=1) < 1.99).any()
+    # Equal points have equal values.
+    _, place = np.unique(np.round(poly.points, 9), axis=0, return_inverse=True)
+    on_floor = poly.points[:, 2] == 0
+    value = poly.point_data["radiosity_W_m2"]
+    for group in np.unique(place[on_floor]):
+        assert np.ptp(value[on_floor & (place == group)]) < 1e-9
+
+
 # Stopping and refusing
 
 
