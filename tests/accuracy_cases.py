@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from radiosity_scenes import cube_with_emitter, truths
+from radiosity_scenes import cube_with_emitter, huge_plates, l_room, spherical_cap, truths
 
 from radiosity.accuracy import surface_points
 from radiosity.solvers.solution import Solution
-from workbench.scene.library import unit_cube
+from workbench.scene.library import diffuse, unit_cube
 from workbench.scene.model import Scene
 
 POINTS = 200
@@ -87,6 +87,26 @@ def _continuous(name: str, case: dict) -> AccuracyCase:
     return AccuracyCase(name, cube_with_emitter(rho_emitter, rho), actual)
 
 
+def _elements(
+    name: str, scene: Scene, wanted: list[float], reflectance: list[float], emission: list[float]
+) -> AccuracyCase:
+    """One element a polygon, whose radiosity is known: the error of their irradiance."""
+    arrives = (np.array(wanted) - emission) / np.array(reflectance)
+
+    def actual(solution: Solution) -> float:
+        order = np.argsort(solution.mesh.element_polygon)
+        return _relative_rms(solution.irradiance[order, 0], arrives, solution.mesh.element_area[order])
+
+    return AccuracyCase(name, scene, actual, {"elements": 1})
+
+
+def _bowl(name: str, case: dict) -> AccuracyCase:
+    """A spherical cap of 40 x 80 facets: the rest of it gives the same irradiance everywhere."""
+    fraction, rho = case["geometry"]["f"], case["geometry"]["rho"]
+    scene = Scene("bowl", (spherical_cap(fraction, 40, 80, diffuse("bowl", rho, 1.0)),), bands=1)
+    return AccuracyCase(name, scene, lambda s: _at_points(s, case["value"]))
+
+
 def accuracy_cases() -> list[AccuracyCase]:
     """All cases; those of the shared truths only where these are present."""
     cases = [_furnace(rho) for rho in (0.0, 0.8, 0.9, 0.99, 0.999)]
@@ -95,4 +115,13 @@ def accuracy_cases() -> list[AccuracyCase]:
             cases.append(_six_faces(name, case))
         elif name.startswith("rad/cube-continuous/"):
             cases.append(_continuous(name, case))
+        elif name.startswith("rad/L-room/"):
+            emitter = int(name.rpartition("-")[2]) - 1
+            glow = [float(i == emitter) for i in range(8)]
+            cases.append(_elements(name, l_room(emitter), case["value"], [0.5] * 8, glow))
+        elif name.startswith("rad/infinite-plates/"):
+            rho, emission = case["geometry"]["rho"], case["geometry"]["e"]
+            cases.append(_elements(name, huge_plates(rho, emission), case["value"], rho, emission))
+        elif name.startswith("rad/bowl/"):
+            cases.append(_bowl(name, case))
     return cases

@@ -108,3 +108,32 @@ def standing_box(*, bottom: bool = True) -> Scene:
     lamp = box_surface("lamp", diffuse("lamp", 0.5, 1.0), *UNIT, inward=True, omit=["-x", "+x", "-y", "+y", "-z"])
     box = box_surface("box", diffuse("box", 0.5), [0.3, 0.35, 0.0], [0.6, 0.65, 0.45], omit=[] if bottom else ["-z"])
     return Scene("room with a box", (room, lamp, box), bands=1, closed=True)
+
+
+def l_room(emitter: int | None = None) -> Scene:
+    """An L-shaped room of eight surfaces, one of which may emit 1."""
+    plan = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
+    floor = np.column_stack([plan, np.zeros(6)])
+    walls = []
+    for i in range(6):
+        (ax, ay), (bx, by) = plan[i], plan[(i + 1) % 6]
+        walls.append(np.array([[ax, ay, 0], [ax, ay, 3], [bx, by, 3], [bx, by, 0]]))
+    polygons = [*walls, (floor + [0, 0, 3])[::-1], floor]
+    surfaces = tuple(
+        Surface.from_polygons(str(i + 1), diffuse(str(i + 1), 0.5, float(i == emitter)), [polygon])
+        for i, polygon in enumerate(polygons)
+    )
+    return Scene("L", surfaces, bands=1, closed=True)
+
+
+def huge_plates(rho: tuple[float, float], emission: tuple[float, float], side: float = 1e7) -> Scene:
+    """Two facing plates at distance 1, so wide that they lose but 2 / side of their light at the rim."""
+    plate = np.array([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]])
+    return Scene(
+        "plates",
+        (
+            Surface.from_polygons("lower", diffuse("lower", rho[0], emission[0]), [plate]),
+            Surface.from_polygons("upper", diffuse("upper", rho[1], emission[1]), [plate[::-1] + [0, 0, 1.0]]),
+        ),
+        bands=1,
+    )

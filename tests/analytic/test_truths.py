@@ -12,6 +12,8 @@ from radiosity_scenes import (
     all_columns,
     cube_with_emitter,
     each_truth,
+    huge_plates,
+    l_room,
     polygon_scene,
     spherical_cap,
     tight,
@@ -159,24 +161,9 @@ def test_winding_of_the_occluder_changes_nothing():
     assert np.allclose(one, two, rtol=1e-13)
 
 
-def _l_room(emitter: int | None = None) -> Scene:
-    plan = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
-    floor = np.column_stack([plan, np.zeros(6)])
-    walls = []
-    for i in range(6):
-        (ax, ay), (bx, by) = plan[i], plan[(i + 1) % 6]
-        walls.append(np.array([[ax, ay, 0], [ax, ay, 3], [bx, by, 3], [bx, by, 0]]))
-    polygons = [*walls, (floor + [0, 0, 3])[::-1], floor]
-    surfaces = tuple(
-        Surface.from_polygons(str(i + 1), diffuse(str(i + 1), 0.5, float(i == emitter)), [polygon])
-        for i, polygon in enumerate(polygons)
-    )
-    return Scene("L", surfaces, bands=1, closed=True)
-
-
 def test_l_room_matrix():
     wanted = np.array(truth("occ/L-room/matrix")["value"])
-    columns, _, bundles = all_columns(_l_room(), tight(1e-7, levels=20))
+    columns, _, bundles = all_columns(l_room(), tight(1e-7, levels=20))
     found, stated = columns.factor.T, columns.spread.T
     assert bundles.counters["rays"] == 0
     assert np.abs(found - wanted).max() < 5e-6
@@ -229,17 +216,7 @@ def test_cube_of_six_elements(name, method):
 @each_truth("rad/infinite-plates/")
 def test_huge_plates_tend_to_infinite_ones(name, method):
     case = truth(name)
-    (rho_1, rho_2), (e_1, e_2) = case["geometry"]["rho"], case["geometry"]["e"]
-    side = 1e7  # finite plates lose 2 / side of their light at the rim
-    plate = np.array([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]])
-    scene = Scene(
-        "plates",
-        (
-            Surface.from_polygons("lower", diffuse("lower", rho_1, e_1), [plate]),
-            Surface.from_polygons("upper", diffuse("upper", rho_2, e_2), [plate[::-1] + [0, 0, 1.0]]),
-        ),
-        bands=1,
-    )
+    scene = huge_plates(case["geometry"]["rho"], case["geometry"]["e"])
     solution = radiosity.solve(scene, method=method, elements=1, workers=1, tolerance=1e-8)
     assert np.abs(solution.radiosity[:, 0] / case["value"] - 1).max() < 1e-6
 
@@ -250,7 +227,7 @@ def test_l_room(name, method):
     case = truth(name)
     emitter = int(name.rpartition("-")[2]) - 1
     solution = radiosity.solve(
-        _l_room(emitter), method=method, elements=1, workers=1, tolerance=1e-8, form_factor_error=1e-7
+        l_room(emitter), method=method, elements=1, workers=1, tolerance=1e-8, form_factor_error=1e-7
     )
     assert np.abs(solution.radiosity[:, 0] - case["value"]).max() < 1e-6
 
