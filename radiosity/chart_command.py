@@ -122,6 +122,10 @@ def chart(
     told = {"scene": scene_digest(loaded), "what": what, "title": f"{loaded.name}: {problem.title}", "reference": kind}
     _same_record(directory, told)
     directory.mkdir(parents=True, exist_ok=True)
+    if not (directory / "record.json").exists():  # at once: an interrupted chart goes on from its runs
+        from workbench.record import RunRecord
+
+        RunRecord("chart", settings=told | {"asked reference": kind}).write(directory / "record.json")
     judge = _reference(problem, kind, directory)
     record = directory / "records.csv"
     before = read_runs(record) if record.exists() else []

@@ -78,6 +78,27 @@ def test_other_questions(tmp_path):
             assert float(row["error"]) < bounds[row["method"]], row
 
 
+def test_an_interrupted_chart_goes_on(tmp_path, monkeypatch):
+    from radiosity.report import speed_accuracy
+
+    arguments = ["cornell-box", "--grid", "6x6", "--repeats", "1", "--methods", "rays", "--sweep", "rays=4,16,64"]
+    kept = speed_accuracy.write_runs
+
+    def interrupted(path, runs):
+        kept(path, runs)
+        if len(runs) == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(speed_accuracy, "write_runs", interrupted)
+        assert CliRunner().invoke(main, ["chart", *arguments, "-o", str(tmp_path / "c")]).exit_code != 0
+    before = rows_of(tmp_path / "c")
+    assert len(before) == 2
+    found = run(*arguments, "-o", str(tmp_path / "c"))
+    assert found.exit_code == 0, found.output
+    assert rows_of(tmp_path / "c")[:2] == before and len(rows_of(tmp_path / "c")) == 3
+
+
 def test_solve_against_a_reference_of_ones_own(tmp_path):
     problem = problem_for("solve", load("l-room"), points=16)
     values = problem.technique("progressive+gather").ask(200, 3).values
