@@ -41,7 +41,8 @@ def fitted(folder: Path) -> None:
         record = folder / name / "records.csv"
         if record.exists():
             runs.setdefault(arguments[2], []).extend(read_runs(record))
-    write_table({what: fit(found) for what, found in runs.items()})
+    # A handful of runs tells nothing of ten counts.
+    write_table({what: fit(found) for what, found in runs.items() if len(found) >= 20})
 
 
 if __name__ == "__main__":
