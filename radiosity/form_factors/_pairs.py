@@ -35,9 +35,9 @@ from workbench.culling.tally import (
 )
 from workbench.geometry.lambert import _HALF_OVER_PI, _edge_term, lambert_piece
 
-MAX_CUT = 32
+MAX_CUT = 128
 """Longest candidate list of a pair that is cut exactly."""
-MAX_FRAGMENTS = 96
+MAX_FRAGMENTS = 512
 """Visible fragments of a sender after which a pair is left to rays."""
 ROOM = 24
 """Corners that a fragment may have."""

@@ -44,6 +44,8 @@ LEAF = 8
 """Most pieces of a leaf of the tree of pairs."""
 STRIPE = 48
 """Most pieces of a task: fixed, so that nothing depends on the number of workers."""
+LARGE = 600
+"""Fewer rows than this are large polygons: longer candidate lists are cut, at more points."""
 COVERED = 0.01
 """Share of a row of a closed scene that must be missing to count as covered (the floor under a box)."""
 ROUNDS = 200
@@ -365,8 +367,9 @@ class _Care:
             share_error=6.0 * error,
             floor=1.0 / max(count, 1),
             # Mean error of a share by rules of 3, 12, 48, ... points a triangle: 2.5 %, 0.6 %, 0.2 %, ...
-            levels=1 + sum(error < limit for limit in (1e-2, 3e-3, 4e-4, 5e-5)),
-            limit=min(12 if error > 5e-3 else 32, _pairs.MAX_CUT),
+            # Few and large polygons have more in their shadows: they get a level more.
+            levels=min(1 + sum(error < limit for limit in (1e-2, 3e-3, 4e-4, 5e-5)) + (count < LARGE), 5),
+            limit=min(12 if error > 5e-3 else 32 if count >= LARGE else _pairs.MAX_CUT, _pairs.MAX_CUT),
             reach=np.array([(factor / relative) ** (1.0 / power) for factor, power in rules]),
         )
 
