@@ -982,11 +982,14 @@ class _Sweep:
         """Lead rays that met the back of a one-sided surface on to what is behind."""
         tracer = self.tracer
         one_sided = np.append(~tracer._materials.both_sides, False)
+        # Doubled each time: a ray that grazes a back must not meet it for ever.
+        step = tracer.offset
         while True:
             behind = met[np.isfinite(t[met]) & ~front[met] & one_sided[tracer._surface[polygon[met]]]]
             if len(behind) == 0:
                 return
-            gone = t[behind] + tracer.offset
+            gone = t[behind] + step
+            step *= 2.0
             start = wave.origins[behind] + gone[:, None] * wave.directions[behind]
             hits = tracer._all.closest_hit(start, wave.directions[behind])
             polygon[behind] = hits.polygon
