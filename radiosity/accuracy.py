@@ -405,7 +405,9 @@ def _improve_factors(scene: Scene, run: _Run, fixed: dict[str, Any], progress: P
         estimate = _parts(solution, None)
         small = solution.mesh.element_count <= TWICE_ELEMENTS
         if best is not None and solution.mesh.element_count == best.mesh.element_count:
-            difference = _relative_rms(solution.irradiance - best.irradiance, float(solution.mean_irradiance.mean()))
+            difference = _relative_rms(
+                solution.element_irradiance - best.element_irradiance, float(solution.mean_irradiance.mean())
+            )
             if difference < estimate.form_factors or estimate.form_factors == 0.0:
                 estimate = replace(estimate, form_factors=difference)
         run.levels.append({"elements": solution.mesh.element_count, "form_factor_error": asked} | estimate.as_dict())

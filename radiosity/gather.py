@@ -220,11 +220,11 @@ class PictureGatherer:
         """Irradiance (n, bands) of the solution at points of polygons. [W m-2]"""
         solution, lookup = self.gatherer.solution, self.gatherer.lookup
         if self._slopes is None:
-            self._slopes = element_gradients(solution.mesh, lookup, solution.irradiance)
+            self._slopes = element_gradients(solution.mesh, lookup, solution.element_irradiance)
         element = lookup.elements(points, polygon, front)
         known = np.maximum(element, 0)
         off = points - solution.mesh.element_centroid[known]
-        found = solution.irradiance[known] + np.einsum("nbk,nk->nb", self._slopes[known], off)
+        found = solution.element_irradiance[known] + np.einsum("nbk,nk->nb", self._slopes[known], off)
         return np.where(element[:, None] >= 0, np.maximum(found, 0.0), 0.0)
 
     def _numbered(self, code: IntArray) -> IntArray:

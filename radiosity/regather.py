@@ -136,7 +136,9 @@ def regathered(
 def _holding(solution: Solution, mesh: PatchMesh, irradiance: FloatArray) -> Solution:
     """The solution with another mesh and irradiance."""
     radiosity = mesh.emission + mesh.reflectance * irradiance
-    return replace(solution, mesh=mesh, radiosity=radiosity, irradiance=irradiance, unshot=np.zeros_like(radiosity))
+    return replace(
+        solution, mesh=mesh, radiosity=radiosity, element_irradiance=irradiance, unshot=np.zeros_like(radiosity)
+    )
 
 
 def _fill_covered(mesh: PatchMesh, irradiance: FloatArray) -> None:
@@ -181,7 +183,7 @@ def _direct_light(
         place, mesh.element_normal[owner], own_polygon=mesh.element_polygon[owner], error=error, counters=counters
     )
     known = np.where(found.crowded[:, None], value[owner], found.irradiance)
-    level = np.average(solution.irradiance, axis=0, weights=solution.mesh.element_area)
+    level = np.average(solution.element_irradiance, axis=0, weights=solution.mesh.element_area)
     differs = (np.abs(known - value[owner]) > STEP * level).any(axis=1)
     uneven[owner[differs]] = True
     change = known - value[owner]

@@ -193,7 +193,7 @@ class Gatherer:
         self.reflected = np.ascontiguousarray(solution.radiosity - np.where(asked[:, None], mesh.emission, 0.0))
         gradient = element_gradients(mesh, self.lookup, self.reflected)
         level = self.reflected - np.einsum("ebk,ek->eb", gradient, mesh.element_centroid)
-        bright = (mesh.reflectance * solution.irradiance).any(axis=1)
+        bright = (mesh.reflectance * solution.element_irradiance).any(axis=1)
         self._coarse = np.where(bright, COARSE * mesh.element_size, 0.0)
         self._sloped = gradient.any(axis=(1, 2))
         self._linear = np.ascontiguousarray(np.concatenate([gradient, level[..., None]], axis=2))
@@ -566,7 +566,7 @@ class Gatherer:
         self._extend(small, np.arange(len(place)), DEEP_RAYS, counters)
         indirect, _, from_sky = small.result()
         # What the mesh holds beside reflected light stays: the emission of lamps with too many facets.
-        own = self.reflected[e] - mesh.reflectance[e] * self.solution.irradiance[e]
+        own = self.reflected[e] - mesh.reflectance[e] * self.solution.element_irradiance[e]
         true = mesh.reflectance[e] * (lit.irradiance + indirect + from_sky) + own
         read = np.einsum("nbk,nk->nb", self._linear[e, :, :3], place) + self._linear[e, :, 3]
         share = weight * near[point, run] / slots[point, run]

@@ -37,7 +37,7 @@ def _at_points(solution: Solution, wanted: float) -> float:
     """Against one irradiance everywhere."""
     points, normals, polygon = surface_points(solution.mesh, POINTS, seed=7)
     error = solution.record.errors["estimate"]["total"]
-    found = solution.irradiance_at(points, normals, own_polygon=polygon, error=min(max(error, 1e-4), 0.1)).irradiance
+    found = solution.irradiance(points, normals, own_polygon=polygon, error=min(max(error, 1e-4), 0.1)).irradiance
     return _relative_rms(found[:, 0], np.full(POINTS, wanted))
 
 
@@ -60,7 +60,7 @@ def _six_faces(name: str, case: dict) -> AccuracyCase:
             wanted[height == 0] = (emitter - 1.0) / rho_emitter
         else:
             known = height > 0  # what a black face sends says nothing of what it receives
-        return _relative_rms(solution.irradiance[known, 0], wanted[known])
+        return _relative_rms(solution.element_irradiance[known, 0], wanted[known])
 
     return AccuracyCase(name, cube_with_emitter(rho_emitter, rho), actual, {"elements": 1})
 
@@ -79,9 +79,9 @@ def _continuous(name: str, case: dict) -> AccuracyCase:
             parts.append(height == 0)
             wanted.append((emitter - 1.0) / rho_emitter)
         area = np.array([mesh.element_area[part].sum() for part in parts])
-        found = [mesh.element_area[p] @ solution.irradiance[p, 0] / a for p, a in zip(parts, area, strict=True)]
+        found = [mesh.element_area[p] @ solution.element_irradiance[p, 0] / a for p, a in zip(parts, area, strict=True)]
         means = _relative_rms(np.array(found), np.array(wanted), area)
-        here = solution.irradiance_at([[0.5, 0.5, 1.0]], [[0, 0, -1.0]], rays=65536).irradiance[0, 0]
+        here = solution.irradiance([[0.5, 0.5, 1.0]], [[0, 0, -1.0]], rays=65536).irradiance[0, 0]
         return max(means, abs(here - centre / rho) * rho / side)
 
     return AccuracyCase(name, cube_with_emitter(rho_emitter, rho), actual)
@@ -95,7 +95,7 @@ def _elements(
 
     def actual(solution: Solution) -> float:
         order = np.argsort(solution.mesh.element_polygon)
-        return _relative_rms(solution.irradiance[order, 0], arrives, solution.mesh.element_area[order])
+        return _relative_rms(solution.element_irradiance[order, 0], arrives, solution.mesh.element_area[order])
 
     return AccuracyCase(name, scene, actual, {"elements": 1})
 

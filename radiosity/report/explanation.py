@@ -332,7 +332,7 @@ def _meshes(
     def read(solution: Solution) -> float:
         lookup = ElementLookup.build(Geometry.from_scene(solution.scene), solution.mesh)
         element = lookup.elements(points[flat], polygons[flat], np.ones(int(flat.sum()), dtype=bool))
-        return relative_rms(solution.irradiance[element], better[flat])[0]
+        return relative_rms(solution.element_irradiance[element], better[flat])[0]
 
     goal = max(error, reached)
     elements, off, spent = count, read(once), took

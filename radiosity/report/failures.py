@@ -428,7 +428,7 @@ def _solve_entries() -> list[Failure]:
     leak = Scene("box in a box", (inside, outside), background=np.zeros(1), bands=1, closed=True)
 
     def outer(solution: Any) -> float:
-        return float(np.abs(solution.irradiance[solution.mesh.element_surface == 1]).max())
+        return float(np.abs(solution.element_irradiance[solution.mesh.element_surface == 1]).max())
 
     return [
         _solved("furnace of 0.999", "stopping at the last change leaves most of the light: e / (1 - rho) = 1000",

@@ -502,7 +502,7 @@ class Solve(Problem):
 
         lookup = ElementLookup.build(self.geometry, solution.mesh)
         element = lookup.elements(self.points, self.polygons, np.ones(len(self.points), dtype=bool))
-        return np.asarray(solution.irradiance[element])
+        return np.asarray(solution.element_irradiance[element])
 
     def _gathered(self, solution: Any, error: float, seed: int) -> tuple[FloatArray, Mapping[str, int]]:
         from radiosity.sensors import Gatherer

@@ -159,7 +159,7 @@ def solve_exchange(
     book = solution.book
     shot, received = area @ (unshot + reflected), area @ arriving
     solution.radiosity += reflected
-    solution.irradiance += arriving
+    solution.element_irradiance += arriving
     unshot[:] = 0.0
     book.shot += shot
     book.received += received

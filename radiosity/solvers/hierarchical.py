@@ -760,12 +760,12 @@ def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, li
     # exchanges light.  E = (K / v) (s + R E) with K symmetric: with R' = R / v, z = sqrt(R') v E solves
     # (1 - sqrt(R') K sqrt(R')) z = sqrt(R') K s.
     right = root * exchange(sent)
-    start = root * bare * (solution.irradiance - incident)
+    start = root * bare * (solution.element_irradiance - incident)
     z = _conjugate_gradients(lambda v: v - root * exchange(root * v), right, start, area, limit)
     seen = sent + root * z
     arriving = exchange(seen)
-    solution.irradiance = incident + arriving / bare
-    solution.radiosity = mesh.emission + mesh.reflectance * solution.irradiance
+    solution.element_irradiance = incident + arriving / bare
+    solution.radiosity = mesh.emission + mesh.reflectance * solution.element_irradiance
     # What was sent of what leaves: the rest, a residual, is yet unshot.
     solution.unshot = bare * (solution.radiosity - seen)
     book.emitted = area @ (mesh.emission + bare * incident)
@@ -964,7 +964,7 @@ def _solved(solver: _Solver, *, limit: float, interrupted: bool) -> tuple[Soluti
         scene=solver.scene,
         mesh=mesh,
         radiosity=mesh.emission + mesh.reflectance * incident,
-        irradiance=incident.copy(),
+        element_irradiance=incident.copy(),
         unshot=np.zeros_like(incident),
         book=EnergyBook.empty(mesh.bands),
         record=solver.record,

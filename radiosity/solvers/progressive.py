@@ -66,7 +66,7 @@ def receive(solution: Solution, arriving: FloatArray, shot: FloatArray) -> None:
     """Let irradiance ``arriving`` (n, bands) of a shot power (bands,) arrive; keep the book."""
     mesh, book = solution.mesh, solution.book
     reflected = mesh.reflectance * arriving
-    solution.irradiance += arriving
+    solution.element_irradiance += arriving
     solution.radiosity += reflected
     solution.unshot += reflected
     received = mesh.element_area @ arriving

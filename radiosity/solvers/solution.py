@@ -156,7 +156,7 @@ class Solution:
     mesh : PatchMesh
     radiosity : (n, bands) float
         Flux leaving per area, emission included. [W m-2]
-    irradiance : (n, bands) float
+    element_irradiance : (n, bands) float
         Flux arriving per area. [W m-2]
     unshot : (n, bands) float
         The part of radiosity that has not been shot yet. [W m-2]
@@ -174,7 +174,7 @@ class Solution:
     scene: Scene
     mesh: PatchMesh
     radiosity: FloatArray
-    irradiance: FloatArray
+    element_irradiance: FloatArray
     unshot: FloatArray
     book: EnergyBook
     record: RunRecord
@@ -192,7 +192,7 @@ class Solution:
     def mean_irradiance(self) -> FloatArray:
         """Area-weighted mean irradiance, (bands,). [W m-2]"""
         area = self.mesh.element_area
-        return (area @ self.irradiance) / area.sum()
+        return (area @ self.element_irradiance) / area.sum()
 
     def state_irradiance_error(self, **mean_squares: FloatArray) -> None:
         """Put named errors of the irradiance into the record, each given by its mean square (bands,).
@@ -208,7 +208,7 @@ class Solution:
         """Radiosity interpolated to the corners of the mesh's pieces, (k, bands). [W m-2]"""
         return corner_values(self.mesh, self.radiosity)
 
-    def irradiance_at(
+    def irradiance(
         self,
         points: ArrayLike,
         normals: ArrayLike,
@@ -258,7 +258,7 @@ class Solution:
         poly = pyvista.PolyData(points, faces=cells)
         for name, values in (
             ("radiosity_W_m2", self.radiosity),
-            ("irradiance_W_m2", self.irradiance),
+            ("irradiance_W_m2", self.element_irradiance),
             ("emission_W_m2", mesh.emission),
             ("unshot_W_m2", self.unshot),
             ("reflectance", mesh.reflectance),
@@ -335,7 +335,7 @@ class Solution:
             np.savez(
                 beside,
                 radiosity_W_m2=self.radiosity,
-                irradiance_W_m2=self.irradiance,
+                irradiance_W_m2=self.element_irradiance,
                 unshot_W_m2=self.unshot,
                 direct_irradiance_W_m2=self.direct_irradiance,
                 state=json.dumps(state, default=float),
@@ -388,7 +388,7 @@ class Solution:
             scene=scene,
             mesh=mesh,
             radiosity=values[0],
-            irradiance=values[1],
+            element_irradiance=values[1],
             unshot=values[2],
             book=book,
             record=record,

@@ -133,7 +133,7 @@ def _start(scene: Scene, mesh: PatchMesh, incident: np.ndarray, record: RunRecor
         scene=scene,
         mesh=mesh,
         radiosity=mesh.emission + reflected,
-        irradiance=incident.copy(),
+        element_irradiance=incident.copy(),
         unshot=mesh.emission + reflected,
         book=book,
         record=record,
@@ -159,7 +159,7 @@ def _resumed(scene: Scene, mesh: PatchMesh, previous: Solution, record: RunRecor
         mesh=mesh,
         # Copies: the earlier solution stays what it was.
         radiosity=previous.radiosity.copy(),
-        irradiance=previous.irradiance.copy(),
+        element_irradiance=previous.element_irradiance.copy(),
         unshot=previous.unshot.copy(),
         book=copy.deepcopy(previous.book),
         record=record,

@@ -63,7 +63,7 @@ def test_a_given_mesh_is_kept():
     assert solution.record.errors["estimate"]["meshing"] == 0.0
     assert solution.record.errors["estimate"]["total"] <= 1e-3
     fine = radiosity.solve(cube_with_emitter(0.5, 0.5), max_edge=0.25, method="direct", form_factor_error=1e-8)
-    off = (solution.irradiance - fine.irradiance) / fine.irradiance.mean()
+    off = (solution.element_irradiance - fine.element_irradiance) / fine.element_irradiance.mean()
     assert np.sqrt((off**2).mean()) < 1e-3
 
 
@@ -93,7 +93,7 @@ def test_an_interrupted_refinement_leaves_the_last_whole_mesh_and_goes_on_to_the
     part = radiosity.solve(scene, **options, progress=stop_in_the_second_mesh)
     assert part.stopped == "interrupted" and not part.converged
     assert part.mesh.element_count == whole.record.results["levels"][0]["elements"]
-    assert (part.irradiance > 0).all()
+    assert (part.element_irradiance > 0).all()
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ box = {{min = [0, 0, 0], max = [4, 4, {height}], inward = true, omit = {omit}}}"
     scene = _scene(tmp_path, text, head="", rho=0, more="")
     solution = radiosity.solve(scene, elements=16, workers=1)
     points = np.column_stack([case["geometry"]["points_xy"], np.zeros(10)])
-    found = solution.irradiance_at(points, [0, 0, 1], error=error, own_polygon=0, workers=1)
+    found = solution.irradiance(points, [0, 0, 1], error=error, own_polygon=0, workers=1)
     assert _judge(found, case["value"], error) < 1e-9
 
 
@@ -96,7 +96,7 @@ radiance = 1000
     )
     scene = _scene(tmp_path, text, head="", rho=0, more="", height=3, omit='["+z"]')
     solution = radiosity.solve(scene, elements=24, workers=1)
-    found = solution.irradiance_at(*_on_walls(case["geometry"]), error=error, workers=1)
+    found = solution.irradiance(*_on_walls(case["geometry"]), error=error, workers=1)
     assert _judge(found, case["value"], error) < 1e-9
 
 
@@ -126,7 +126,7 @@ exitance = 100
         rows.append((np.stack([0 * s + place, s, low], 1), [normal, 0, 0], 0.625 * weight))
         rows.append((np.stack([s, 0 * s + place, low], 1), [0, normal, 0], 0.625 * weight))
     received = sum(
-        weights @ solution.irradiance_at(points, normal, error=error, workers=1).irradiance[:, 0]
+        weights @ solution.irradiance(points, normal, error=error, workers=1).irradiance[:, 0]
         for points, normal, weights in rows
     )
     assert received == pytest.approx(100.0, rel=error / 10)
@@ -156,7 +156,7 @@ direction = [1, 0.3, 0]
 irradiance = 100
 """
     solution = radiosity.solve(_scene(tmp_path, text), elements=64, workers=1)
-    found = solution.irradiance_at(*_on_walls(case["geometry"]), error=error, workers=1)
+    found = solution.irradiance(*_on_walls(case["geometry"]), error=error, workers=1)
     per_wall = 100.0 * 0.3 / math.hypot(1, 0.3)
     wanted = np.array(case["value"]) / 100 * per_wall * 0.5
     assert not found.direct.any()
@@ -190,7 +190,7 @@ intensity = {intensity}
         u, v, weight = u.ravel(), v.ravel(), np.outer(w, w).ravel() / 4
         points = np.concatenate([np.stack([u, 0 * u, v], 1), np.stack([u, v, 0 * u], 1)])
         normals = np.repeat([[0, 1, 0], [0, 0, 1]], len(u), axis=0)
-        found = solution.irradiance_at(points, normals, error=error, workers=1)
+        found = solution.irradiance(points, normals, error=error, workers=1)
         mean = np.tile(weight, 2) @ found.indirect[:, 0] / 2
         wanted = case["value"][case["geometry"]["rho"].index(rho)]
         assert mean == pytest.approx(wanted, rel=error)
@@ -221,7 +221,7 @@ holes = [[[1.5, 1.5, 3], [2.5, 1.5, 3], [2.5, 2.5, 3], [1.5, 2.5, 3]]]
         tmp_path, ROOM + (ceiling if size == "1x1" else ""), head="", rho=0, more=more, height=3, omit='["+z"]'
     )
     solution = radiosity.solve(scene, elements=24, workers=1)
-    found = solution.irradiance_at(*_on_walls(case["geometry"]), error=error, workers=1)
+    found = solution.irradiance(*_on_walls(case["geometry"]), error=error, workers=1)
     assert _judge(found, case["value"], error) < 1e-6
 
 
@@ -241,5 +241,5 @@ holes = [[[1, 0, 1], [3, 0, 1], [3, 0, 2], [1, 0, 2]]]
     solution = radiosity.solve(scene, elements=24, workers=1)
     points = [[2, 4, z] for z in geometry["z"]] + [[2, y, h] for h in (0, 3) for y in geometry["y"]]
     normals = [[0, -1, 0]] * 6 + [[0, 0, 1]] * 8 + [[0, 0, -1]] * 8
-    found = solution.irradiance_at(points, normals, error=error, workers=1)
+    found = solution.irradiance(points, normals, error=error, workers=1)
     assert _judge(found, case["value"], error) < 1e-9

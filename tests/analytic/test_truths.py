@@ -261,7 +261,7 @@ def test_bowl(name):
         solution = radiosity.solve(
             scene, method="direct", elements=1, workers=1, form_factor_error=0.02, tolerance=1e-6
         )
-        errors.append(np.abs(solution.irradiance[:, 0] / case["value"] - 1).max())
+        errors.append(np.abs(solution.element_irradiance[:, 0] / case["value"] - 1).max())
     assert errors[1] < 0.018 and errors[1] < 0.65 * errors[0]
 
 
@@ -303,7 +303,7 @@ def test_concentric_spheres_exchange():
     solution = radiosity.solve(scene, elements=500, workers=1, tolerance=1e-4)
     mesh = solution.mesh
     own = mesh.element_surface == 0
-    net = mesh.element_area[own] @ (solution.radiosity[own, 0] - solution.irradiance[own, 0])
+    net = mesh.element_area[own] @ (solution.radiosity[own, 0] - solution.element_irradiance[own, 0])
     # 320 facets have 2.4 % less area than the sphere; the formula holds for the facets' areas.
     a_1, a_2 = mesh.element_area[own].sum(), mesh.element_area[~own].sum()
     exact = 1 / (rho_1 / ((1 - rho_1) * a_1) + 1 / a_1 + rho_2 / ((1 - rho_2) * a_2))

@@ -100,7 +100,7 @@ def test_several_numbers_of_samples_give_a_row_each_and_the_slope_of_the_error(s
         assert picture.size[0] > 1500  # a fourth panel
 
 
-def test_exact_irradiance_at_points_from_a_file(scene, tmp_path):
+def test_exact_irradiance_points_from_a_file(scene, tmp_path):
     points = tmp_path / "points.csv"
     points.write_text("x,y,z,nx,ny,nz\n0,0,0,0,0,2\n1.5,0,0,0,0,1\n\n0,0,0,0,0,-1\n")
     result = run(scene, "--points", points, "--method", "exact", "--json", "-")

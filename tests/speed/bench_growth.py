@@ -85,7 +85,7 @@ def gathered(name: str, errors: list[float]) -> None:
         start = time.process_time()
         solution = solve_hierarchical(scene, geometry, record, link_error=error, **options)
         seconds = time.process_time() - start
-        found = solution.irradiance_at(points, normals, error=0.002, own_polygon=polygon, rays=2048).irradiance
+        found = solution.irradiance(points, normals, error=0.002, own_polygon=polygon, rays=2048).irradiance
         median = float(np.median((np.abs(found - mean) / np.where(lit, mean, 1.0))[lit]))
         out.write(
             f"{error:10.1e} {solution.mesh.element_count:8} {record.results['links']:8} {seconds:7.2f}"

@@ -56,7 +56,7 @@ def _ours(scene: workbench.Scene, points, normals, own, runs, mesh: tuple[int, f
         else:
             solution = radiosity.solve(scene, elements=mesh[0], form_factor_error=mesh[1], tolerance=TARGET)
         spent["solve"] = time.perf_counter() - start
-        found = solution.irradiance_at(points, normals, own_polygon=own, error=0.7 * TARGET)
+        found = solution.irradiance(points, normals, own_polygon=own, error=0.7 * TARGET)
         spent["sensors"] = time.perf_counter() - start - spent["solve"]
         spent["elements"] = solution.mesh.element_count
         return found.irradiance
@@ -141,7 +141,7 @@ def main() -> None:
     if len(runs) < 2:
         parser.error(f"no reference yet; run python tests/speed/sensor_reference.py {options.scene} first")
     # Kernels warm: a small question first.
-    radiosity.solve(scene, elements=100).irradiance_at(points[:50], normals[:50], own_polygon=own[:50])
+    radiosity.solve(scene, elements=100).irradiance(points[:50], normals[:50], own_polygon=own[:50])
     meshes: list[tuple[int, float] | None] = [(230, 0.1), (300, 0.05), (500, 0.02), None]
     results = {mesh: _ours(scene, points, normals, own, runs, mesh) for mesh in meshes}
     good = {mesh: value for mesh, value in results.items() if value[0] <= TARGET}

@@ -26,7 +26,7 @@ def _lit_wall(max_edge, values=None):
     )
     solution = radiosity.solve(scene, max_edge=max_edge, workers=1)
     mesh = solution.mesh
-    solution.irradiance[:] = 0.0  # of nowhere: nothing can be found anew of this light
+    solution.element_irradiance[:] = 0.0  # of nowhere: nothing can be found anew of this light
     solution.radiosity[:] = np.where(mesh.element_surface == 0, 1.0, mesh.emission[:, 0])[:, None]
     if values is not None:
         rows = mesh.element_surface == 0
@@ -66,7 +66,7 @@ def test_9_2_no_steps_one_element_wide(rays):
 def test_9_3_the_centre_of_a_face_is_not_its_mean():
     wanted = 0.17914195
     solution = radiosity.solve(cube_with_emitter(0.0, 0.5), max_edge=1 / 8, tolerance=1e-5, workers=1)
-    found = solution.irradiance_at([[0.5, 0.5, 1.0]], [[0, 0, -1]], error=1e-4, workers=1)
+    found = solution.irradiance([[0.5, 0.5, 1.0]], [[0, 0, -1]], error=1e-4, workers=1)
     assert 0.5 * found.irradiance[0, 0] == pytest.approx(wanted, rel=2e-3)
     top = solution.mesh.element_centroid[:, 2] == 1.0
     mean = solution.radiosity[top, 0].mean()
@@ -83,7 +83,7 @@ def test_9_4_direct_light_is_not_counted_twice():
         floor = box_surface("floor", diffuse("floor", rho), [-4, -4, -1], [4, 4, 0], omit=["-z"])
         lamp = Surface.from_polygons("lamp", diffuse("lamp", 0.0, np.pi), [light])
         solution = radiosity.solve(Scene("row", (floor, lamp), bands=1), elements=200, workers=1)
-        found = solution.irradiance_at(points, [0, 0, 1], error=1e-3, workers=1)
+        found = solution.irradiance(points, [0, 0, 1], error=1e-3, workers=1)
         assert found.irradiance[:, 0] == pytest.approx(case["value"], rel=1e-9)
 
 

@@ -121,7 +121,7 @@ def test_a_furnace_glows_alike_everywhere(rho, scene):
     furnace = replace(base, surfaces=tuple(replace(s, material=paint) for s in base.surfaces))
     solution = solve(furnace, link_error=0.01, tolerance=1e-8)
     mesh = solution.mesh
-    lit = solution.irradiance[:, 0] > 0.0
+    lit = solution.element_irradiance[:, 0] > 0.0
     # The floor under the box sees nothing; what is covered in part has the value of its bare part.
     assert lit.all() or scene == "box"
     assert mesh.element_area[lit].sum() > 0.97 * mesh.element_area.sum()
@@ -135,7 +135,7 @@ def test_the_energy_book_balances(closed):
     assert book.imbalance(solution.unshot_power) < 1e-12
     assert np.allclose(book.shot, book.received + book.escaped, rtol=1e-12)
     held = mesh.element_area @ (solution.radiosity - mesh.emission)
-    assert np.allclose(held, mesh.element_area @ (mesh.reflectance * solution.irradiance), rtol=1e-12)
+    assert np.allclose(held, mesh.element_area @ (mesh.reflectance * solution.element_irradiance), rtol=1e-12)
     if closed:
         assert book.absorbed[0] == pytest.approx(book.emitted[0], rel=1e-6)
     errors = solution.record.errors
@@ -160,8 +160,8 @@ def test_it_agrees_with_the_direct_solver_on_the_same_elements(scene):
     assert np.allclose(solution.mesh.element_centroid[order], judge.mesh.element_centroid[wanted], atol=1e-9)
     # Where the box covers a part the judge gives the mean over all of an element, not over its bare part.
     whole = np.abs(judge.mesh.element_centroid[wanted, 2]) > 1e-9
-    off = (solution.irradiance[order, 0] - judge.irradiance[wanted, 0])[whole]
-    assert np.sqrt((off**2).mean()) < (1e-4 if scene == "cube" else 0.01) * judge.irradiance.mean()
+    off = (solution.element_irradiance[order, 0] - judge.element_irradiance[wanted, 0])[whole]
+    assert np.sqrt((off**2).mean()) < (1e-4 if scene == "cube" else 0.01) * judge.element_irradiance.mean()
 
 
 def test_the_answer_does_not_depend_on_the_number_of_workers():
@@ -203,7 +203,7 @@ def test_failure_mode_5_7_a_dip_between_agreeing_corners_is_found():
         point_to_polygon([[0, 0, 0]], [[0, 0, 1.0]], np.array(surface.face(0)[0]))[0] for surface in scene.surfaces[1:]
     )
     assert sheet > lamp
-    assert solution.irradiance[middle, 0].max() < 0.3 * lamp
+    assert solution.element_irradiance[middle, 0].max() < 0.3 * lamp
 
 
 @each_truth("rad/L-room/")
@@ -221,9 +221,11 @@ def test_leaving_direct_light_to_points_makes_fewer_elements():
     assert 3 * gathered.mesh.element_count < shown.mesh.element_count
     area = gathered.mesh.element_area
     floor = gathered.mesh.element_surface == 0
-    mean = np.average(gathered.irradiance[floor, 0], weights=area[floor])
+    mean = np.average(gathered.element_irradiance[floor, 0], weights=area[floor])
     own = shown.mesh.element_surface == 0
-    assert mean == pytest.approx(np.average(shown.irradiance[own, 0], weights=shown.mesh.element_area[own]), rel=0.02)
+    assert mean == pytest.approx(
+        np.average(shown.element_irradiance[own, 0], weights=shown.mesh.element_area[own]), rel=0.02
+    )
 
 
 def test_the_conforming_export_has_no_t_junctions():
@@ -268,9 +270,9 @@ def test_ctrl_c_leaves_a_usable_solution():
 
     solution = solve(scene, link_error=5e-3, progress=stop)
     assert solution.stopped == "interrupted" and not solution.converged
-    assert np.isfinite(solution.radiosity).all() and (solution.irradiance >= 0).all()
+    assert np.isfinite(solution.radiosity).all() and (solution.element_irradiance >= 0).all()
     assert solution.book.imbalance(solution.unshot_power) < 1e-12
-    means = [np.average(s.irradiance[:, 0], weights=s.mesh.element_area) for s in (solution, whole)]
+    means = [np.average(s.element_irradiance[:, 0], weights=s.mesh.element_area) for s in (solution, whole)]
     assert 0.2 < means[0] / means[1] < 2.0
 
 

@@ -36,7 +36,7 @@ def test_furnace_is_constant_at_every_point():
     solution = radiosity.solve(unit_cube(0.5, 1.0), elements=24, tolerance=1e-6, workers=1)
     rng = np.random.default_rng(0)
     points, normals = rng.uniform(0.02, 0.98, (50, 3)), rng.normal(size=(50, 3))
-    found = solution.irradiance_at(points, normals, workers=1)
+    found = solution.irradiance(points, normals, workers=1)
     assert np.abs(found.irradiance / 2.0 - 1).max() < 1e-4
     assert np.abs(found.direct - 1.0).max() < 1e-6  # the emission itself, in closed form
 
@@ -44,7 +44,7 @@ def test_furnace_is_constant_at_every_point():
 def test_black_scene_has_direct_light_only():
     scene = cube_with_emitter(0.0, 0.0)
     solution = radiosity.solve(scene, elements=24, workers=1)
-    found = solution.irradiance_at([[0.5, 0.5, 0.5]], [[0, 0, -1]], workers=1)
+    found = solution.irradiance([[0.5, 0.5, 0.5]], [[0, 0, -1]], workers=1)
     assert found.method == "none" and not found.indirect.any()
     # Lambert over the unit square from half its side above the middle: 0.5541264 (the hemicube's top).
     assert found.irradiance[0, 0] == pytest.approx(0.55412642398, abs=1e-9)
@@ -88,7 +88,7 @@ def test_answer_does_not_depend_on_workers(cornell):
 def test_distance_is_the_harmonic_mean():
     # From the middle of a sphere-like cube of side 2: between 1 (faces) and sqrt 3 (corners).
     solution = radiosity.solve(unit_cube(0.5, 1.0), elements=6, workers=1)
-    found = solution.irradiance_at([[0.5, 0.5, 0.5], [0.5, 0.5, 0.01]], [[0, 0, 1], [1, 0, 0]], workers=1, rays=256)
+    found = solution.irradiance([[0.5, 0.5, 0.5], [0.5, 0.5, 0.01]], [[0, 0, 1], [1, 0, 0]], workers=1, rays=256)
     assert 0.5 < found.distance[0] < 0.5 * np.sqrt(3)
     assert found.distance[1] < 0.1  # close above the floor
 
@@ -109,7 +109,7 @@ def test_panes_dim_what_lies_behind_them():
 
     solution = radiosity.solve(room(0.3), elements=3, workers=1)
     points, normals = np.array([[0.5, 0.5, 0.9], [0.5, 0.5, 0.01]]), np.array([[0, 0, -1.0], [0, 0, 1.0]])
-    found = solution.irradiance_at(points, normals, workers=1, rays=4096)
+    found = solution.irradiance(points, normals, workers=1, rays=4096)
     from radiosity.form_factors.analytic import point_to_polygon
 
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -128,8 +128,8 @@ def test_the_back_of_a_one_sided_surface_is_black_and_blocks():
     floor = Surface.from_polygons("floor", diffuse("floor", 0.5), [square])
     shelf = Surface.from_polygons("shelf", diffuse("shelf", 0.9), [square + [0, 0, 1.0]])
     solution = radiosity.solve(Scene("shelf", (lamp, floor, shelf), bands=1), elements=30, workers=1)
-    below = solution.irradiance_at([[0.5, 0.5, 0.9]], [[0, 0, 1]], workers=1, rays=256)
-    above = solution.irradiance_at([[0.5, 0.5, 1.9]], [[0, 0, -1]], workers=1, rays=256)
+    below = solution.irradiance([[0.5, 0.5, 0.9]], [[0, 0, 1]], workers=1, rays=256)
+    above = solution.irradiance([[0.5, 0.5, 1.9]], [[0, 0, -1]], workers=1, rays=256)
     assert below.irradiance[0, 0] == 0.0
     assert above.indirect[0, 0] > 0.0
 
@@ -151,7 +151,7 @@ def test_emission_of_a_mesh_of_many_facets_is_counted_once():
     values = []
     for scene in (one, many):
         solution = radiosity.solve(scene, elements=300, workers=1, tolerance=1e-3)
-        values.append(solution.irradiance_at(point, normal, own_polygon=0, workers=1, rays=4096))
+        values.append(solution.irradiance(point, normal, own_polygon=0, workers=1, rays=4096))
     assert not values[1].direct.any()
     assert values[1].irradiance[0, 0] == pytest.approx(values[0].irradiance[0, 0], rel=0.01)
 

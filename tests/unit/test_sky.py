@@ -97,7 +97,7 @@ def test_crowded_points_fall_back_to_rays_with_an_honest_error():
     )
     solution = radiosity.solve(scene, elements=1, workers=1)
     points, normals = np.array([[0.5, 0.5, 0.0], [0.25, 0.5, 0.0]]), np.array([[0, 0, 1.0], [0, 0, 1]])
-    found = solution.irradiance_at(points, normals, own_polygon=0, workers=1, error=0.01)
+    found = solution.irradiance(points, normals, own_polygon=0, workers=1, error=0.01)
     assert found.method == "rays"
     # The bars hide their form factor each: Lambert's sum over all of them, exact as none overlaps.
     from radiosity.form_factors.analytic import point_to_polygon
@@ -144,8 +144,8 @@ def test_background_is_a_uniform_sky_all_round():
     floor = Surface.from_polygons("floor", diffuse("floor", 0.5), [[[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]])
     scene = Scene("open", (floor,), bands=1, background=np.array([2.0]))
     solution = radiosity.solve(scene, elements=4, workers=1)
-    assert np.allclose(solution.irradiance, 2 * math.pi, rtol=1e-9)
-    found = solution.irradiance_at([[0.5, 0.5, 0.5]], [[1, 0, 0]], workers=1)
+    assert np.allclose(solution.element_irradiance, 2 * math.pi, rtol=1e-9)
+    found = solution.irradiance([[0.5, 0.5, 0.5]], [[1, 0, 0]], workers=1)
     assert found.direct[0, 0] < 2 * math.pi and found.direct[0, 0] > math.pi
 
 

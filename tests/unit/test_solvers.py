@@ -68,7 +68,7 @@ class Stop:
 def test_one_and_two_workers_agree_bit_for_bit(scene):
     one, two = (radiosity.solve(scene, elements=200, workers=k, tolerance=1e-3) for k in (1, 2))
     assert (one.radiosity == two.radiosity).all()
-    assert (one.irradiance == two.irradiance).all()
+    assert (one.element_irradiance == two.element_irradiance).all()
     assert (one.unshot == two.unshot).all()
     assert dict(one.record.counters) == dict(two.record.counters)
     if len(scene.surfaces) == 3 and scene.surfaces[2].face_count > 64:
@@ -93,7 +93,7 @@ def test_direct_and_progressive_agree(scene):
     assert direct.mesh.element_count == shot.mesh.element_count
     mean = np.average(direct.radiosity, axis=0, weights=direct.mesh.element_area)
     assert np.abs(direct.radiosity - shot.radiosity).max() < 0.02 * mean
-    assert np.abs(direct.irradiance - shot.irradiance).max() < 0.03 * mean
+    assert np.abs(direct.element_irradiance - shot.element_irradiance).max() < 0.03 * mean
 
 
 def test_patches_of_four_elements_agree_with_elements_that_shoot_alone():
@@ -124,7 +124,7 @@ def test_the_energy_book_balances_at_every_step(scene):
         assert np.allclose(book.shot, book.received + book.escaped, rtol=1e-12)
         # And the elements tell the same: what they hold was emitted or reflected.
         mesh = solution.mesh
-        reflected = mesh.element_area @ (mesh.reflectance * solution.irradiance)
+        reflected = mesh.element_area @ (mesh.reflectance * solution.element_irradiance)
         held = mesh.element_area @ (solution.radiosity - mesh.emission)
         assert np.allclose(held, reflected, rtol=1e-12)
         seen.append((event.shots, book.shot.sum(), event.residual))
@@ -159,7 +159,7 @@ def test_the_open_box_loses_what_leaves_through_its_lid():
     kept = radiosity.solve(lidded, max_edge=0.25, workers=1, tolerance=1e-6, form_factor_error=1e-3)
     black = kept.mesh.element_surface == 2
     assert lost.book.escaped[0] == pytest.approx(
-        float(kept.mesh.element_area[black] @ kept.irradiance[black, 0]), rel=2e-3
+        float(kept.mesh.element_area[black] @ kept.element_irradiance[black, 0]), rel=2e-3
     )
 
 
@@ -174,13 +174,13 @@ def test_the_bound_on_the_remaining_error_is_a_bound(rho, scene, monkeypatch):
     base = cube_with_emitter(0.0, rho) if scene == "cube" else room_with_ball(closed=False)
     whole, bundles = started(base, elements=60)
     shoot_until(whole, bundles, tolerance=1e-9)
-    total = whole.mesh.element_area @ whole.irradiance
+    total = whole.mesh.element_area @ whole.element_irradiance
     solution, again = started(base, elements=60)
     bounds, errors = [], []
 
     def check(event):
         assert event.residual == remaining_bound(solution)
-        missing = total - solution.mesh.element_area @ solution.irradiance
+        missing = total - solution.mesh.element_area @ solution.element_irradiance
         bounds.append(event.residual)
         errors.append(float((missing / total).max()))
 
@@ -403,7 +403,7 @@ def _lit(light=None, *, background=0.0, others=(), elements=400):
     )
     solution = radiosity.solve(scene, elements=elements, workers=1, tolerance=0.5)
     own = solution.mesh.element_surface == 0
-    return solution.mesh.element_centroid[own], solution.irradiance[own, 0], solution.mesh.element_area[own]
+    return solution.mesh.element_centroid[own], solution.element_irradiance[own, 0], solution.mesh.element_area[own]
 
 
 def _light(kind, **values):
@@ -500,7 +500,7 @@ def test_incident_light_is_reflected_and_booked():
     assert solution.book.emitted[0] == pytest.approx(40 * np.pi, rel=5e-3)
     assert solution.book.absorbed[0] == pytest.approx(solution.book.emitted[0], rel=1e-4)
     direct = solution.direct_irradiance[:, 0]
-    indirect = solution.irradiance[:, 0] - direct
+    indirect = solution.element_irradiance[:, 0] - direct
     # Mean indirect irradiance: rho Phi / (S (1 - rho)).
     assert np.average(indirect, weights=solution.mesh.element_area) == pytest.approx(
         0.5 * 40 * np.pi / (6 * 0.5), rel=5e-3
@@ -540,7 +540,7 @@ def test_elements_that_see_nothing_are_left_alone(method):
         assert np.isfinite(solution.radiosity).all()
         if bottom:
             hidden = (mesh.element_surface == 2) & (mesh.element_normal[:, 2] < -0.5)
-            assert hidden.any() and (solution.irradiance[hidden] == 0).all()
+            assert hidden.any() and (solution.element_irradiance[hidden] == 0).all()
         lamp = mesh.element_surface == 1
         means.append(np.average(solution.radiosity[lamp, 0], weights=mesh.element_area[lamp]))
     assert means[0] == pytest.approx(means[1], rel=0.01)
@@ -562,7 +562,7 @@ def test_the_matrix_solver_agrees_with_its_judge():
     fine = radiosity.solve(scene, method="direct", elements=150, form_factor_error=1e-3, workers=1)
     fast = radiosity.solve(scene, method="matrix", elements=150, form_factor_error=2e-3, workers=1)
     assert fast.mesh.element_count == fine.mesh.element_count
-    off = (fast.irradiance - fine.irradiance) / fine.irradiance.mean()
+    off = (fast.element_irradiance - fine.element_irradiance) / fine.element_irradiance.mean()
     stated = fast.record.errors["irradiance_form_factors_rms"] + fine.record.errors["irradiance_form_factors_rms"]
     assert np.sqrt((off**2).mean()) < min(3 * stated, 0.02)
     assert fast.book.imbalance(fast.unshot_power) < 1e-12
