@@ -514,9 +514,10 @@ def apply_rays(pairs, counts, a, b, whole, starts, weights, blocked, area, excha
             # Only rays know how much of a cluster its own facets see.
             value = min(area[x] * area[x] * total / (math.pi * counts[i]), area[x])
         if total <= 0.0:
-            # No points of the two faced each other: a grazing glance at most, half of it, in doubt whole.
-            exchange[k] = 0.5 * value if x != y else 0.0
-            doubt[k] = exchange[k]
+            # No points of the two faced each other: a grazing glance at most, past occluders.  Dark rather than
+            # a leak; in doubt whole.
+            exchange[k] = 0.0
+            doubt[k] = value if x != y else 0.0
             continue
         share = seen / total
         effective = total * total / square
