@@ -251,11 +251,15 @@ def _receives_at_a(a, b, area, bright):
     return bright[b] * math.sqrt(area[b]) >= bright[a] * math.sqrt(area[a])
 
 
+NOT_SEEN = 2.0
+"""No share: the points from which it was asked do not see the other node."""
+
+
 @njit(nogil=True, cache=True)
 def _share_at(points, count, x, y, tree, geo, found, many, limit, work, values, tally):
     """Visible share of node ``y`` from points on ``x``: the share and the deviation of the form factor.
 
-    The share is below zero if a point needs rays.
+    The share is below zero if a point needs rays, and ``NOT_SEEN`` if no point sees the node at all.
     """
     seen = whole = square = weight = 0.0
     for k in range(count):
@@ -275,7 +279,7 @@ def _share_at(points, count, x, y, tree, geo, found, many, limit, work, values, 
         weight += w
     mean = seen / weight
     deviation = math.sqrt(max(square / weight - mean * mean, 0.0))
-    return (seen / whole if whole > 0.0 else 0.5), deviation
+    return (seen / whole if whole > 0.0 else NOT_SEEN), deviation
 
 
 @njit(nogil=True, cache=True)
@@ -403,14 +407,23 @@ def measure(
             new_count[i] = many
         if 0 < many <= CUTS:
             at_a = _receives_at_a(x, y, tree.area, bright)
-            if at_a:
-                share, deviation = _share_at(
-                    pa, na, x, y, tree, geo, work.found, many, limit, work, va, tally
-                )  # fmt: skip
-            else:
-                share, deviation = _share_at(
-                    pb, nb, y, x, tree, geo, work.found, many, limit, work, vb, tally
-                )  # fmt: skip
+            share = NOT_SEEN
+            for _ in range(2):
+                if at_a:
+                    share, deviation = _share_at(
+                        pa, na, x, y, tree, geo, work.found, many, limit, work, va, tally
+                    )  # fmt: skip
+                else:
+                    share, deviation = _share_at(
+                        pb, nb, y, x, tree, geo, work.found, many, limit, work, vb, tally
+                    )  # fmt: skip
+                if share != NOT_SEEN:
+                    break
+                at_a = not at_a  # only a sliver lies above this end's horizon: the other end sees it
+            if share == NOT_SEEN:
+                # Slivers both ways: half of it, in doubt as a whole.
+                share = 0.5
+                deviation = open_a if at_a else open_b
             if share >= 0.0:
                 share = min(share, 1.0)
                 exchange[i] = value * share
