@@ -52,6 +52,8 @@ BUDGET_ELEMENTS = 64
 """Most elements of the first mesh where time is limited: it is solved whatever it takes."""
 MESHING_SHARE = 0.7
 """Share of the error that the mesh may take."""
+LEAST_GROWTH, MOST_STUCK = 1.3, 8
+"""Growth below which a mesh counts as the same, and how often the number asked for is doubled then."""
 GROWTH = (1.8, 8.0)
 """Least and largest growth of the number of elements from mesh to mesh."""
 COST_POWER = 1.7
@@ -297,6 +299,7 @@ def _refine(
     if math.isfinite(run.seconds):
         count = min(count, BUDGET_ELEMENTS)
     method = _method(scene, run)
+    stuck = 0
     unfinished = resume
     if resume is not None:
         run.levels = list(resume.record.results.get("levels", []))
@@ -342,6 +345,13 @@ def _refine(
                 return _finish(run, solution, _parts(solution, math.inf), reason)
             best.stopped = best.stopped if run.left < 0 else "interrupted"
             return _finish(run, best, estimate, reason)
+        n = solution.mesh.element_count
+        if run.levels and n < LEAST_GROWTH * run.levels[-1]["elements"]:
+            # Clusters of facets come in steps: as good as the same mesh tells nothing.
+            if stuck >= MOST_STUCK:
+                return _finish(run, solution, _parts(solution, math.inf), "no finer mesh can be made")
+            stuck, count = stuck + 1, 2 * count
+            continue
         begin = time.perf_counter()
         if where is None:
             # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
@@ -354,14 +364,12 @@ def _refine(
         mean = float(solution.mean_irradiance.mean())
         difference = None if run.seen is None else _relative_rms(found.irradiance - run.seen, mean)
         run.seen = found.irradiance
-        best = solution
-        n = solution.mesh.element_count
+        best, stuck = solution, 0
         run.levels.append({"elements": n, "difference": difference, "seconds": time.perf_counter() - run.start})
         order = _order(run.levels)
         meshing = math.inf
         if difference is not None:
-            growth = n / run.levels[-2]["elements"]
-            meshing = difference / (growth**order - 1.0) if growth > 1.0 else difference
+            meshing = difference / ((n / run.levels[-2]["elements"]) ** order - 1.0)
         estimate = _parts(solution, meshing)
         run.levels[-1] |= estimate.as_dict()
         run.spent["error estimate"] = run.spent.get("error estimate", 0.0) + time.perf_counter() - begin
