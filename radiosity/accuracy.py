@@ -41,6 +41,8 @@ POINTS = 256
 """Points at which two meshes are compared."""
 GATHER_RAYS = 1024
 """Rays a point for that comparison: the same rays each time, so that their own error cancels."""
+NOISE, MOST_DRAWS = 0.004, 16
+"""What one such comparison cannot tell from nothing, and the most that are averaged."""
 ORDER = 0.9
 """Power of the number of elements with which the meshing error falls, until it has been seen to."""
 ORDERS = (0.5, 1.5)
@@ -54,7 +56,7 @@ MESHING_SHARE = 0.7
 """Share of the error that the mesh may take."""
 LEAST_GROWTH, MOST_STUCK = 1.3, 8
 """Growth below which a mesh counts as the same, and how often the number asked for is doubled then."""
-GROWTH = (1.8, 8.0)
+GROWTH = (2.5, 8.0)
 """Least and largest growth of the number of elements from mesh to mesh."""
 COST_POWER = 1.7
 """Power of the number of elements with which the seconds grow."""
@@ -274,6 +276,21 @@ def _first_error(run: _Run) -> float:
     return run.target if run.target > 0 else 0.1
 
 
+def _look(gatherer: Gatherer, where: tuple[FloatArray, FloatArray, IntArray], run: _Run) -> FloatArray:
+    """Irradiance at the points, by the same rays for every mesh.
+
+    Only what is gathered again at a few hits is drawn anew: for small targets the mean over several draws.
+    """
+    draws = min(max(round((NOISE / _first_error(run)) ** 2), 1), MOST_DRAWS)
+    total = np.zeros((len(where[0]), gatherer.solution.mesh.bands))
+    for seed in range(1, draws + 1):
+        gatherer.seed = seed
+        total += gatherer.irradiance(
+            where[0], where[1], own_polygon=where[2], rays=GATHER_RAYS, error=max(_first_error(run), 1e-4)
+        ).irradiance
+    return total / draws
+
+
 def _method(scene: Scene, run: _Run) -> str:
     """The solver for all meshes of a run."""
     asked = str(run.options.get("method", "auto"))
@@ -358,12 +375,10 @@ def _refine(
             where = surface_points(build_mesh(scene, Geometry.from_scene(scene)), POINTS)
         if gatherer is None:
             gatherer = Gatherer(solution, workers=run.options.get("workers"), seed=1)
-        found = gatherer.reading(solution).irradiance(
-            where[0], where[1], own_polygon=where[2], rays=GATHER_RAYS, error=max(_first_error(run), 1e-4)
-        )
+        seen = _look(gatherer.reading(solution), where, run)
         mean = float(solution.mean_irradiance.mean())
-        difference = None if run.seen is None else _relative_rms(found.irradiance - run.seen, mean)
-        run.seen = found.irradiance
+        difference = None if run.seen is None else _relative_rms(seen - run.seen, mean)
+        run.seen = seen
         best, stuck = solution, 0
         run.levels.append({"elements": n, "difference": difference, "seconds": time.perf_counter() - run.start})
         order = _order(run.levels)
