@@ -109,8 +109,9 @@ def explain(
     found = Explanation(solution)
     geometry = Geometry.from_scene(scene)
     _mesh_facts(found, geometry, error)
-    report("finding form factors with decisions switched off ...")
-    _links(found, geometry, seed, repeats)
+    if solution.record.settings["method"] != "matrix":  # whose decisions are told with the meshes
+        report("finding form factors with decisions switched off ...")
+        _links(found, geometry, seed, repeats)
     report("finding shadows with decisions switched off ...")
     points = surface_points(solution.mesh, POINTS, seed=3)
     _shadows(found, geometry, points, error, seed, repeats, workers)
@@ -307,9 +308,9 @@ def _meshes(
     } | {"workers": workers}
     flat = polygons >= 0
 
-    def solved(elements: int) -> tuple[Solution, float]:
+    def solved(elements: int = count, **other: Any) -> tuple[Solution, float]:
         start = perf_counter()
-        solution = solve(final.scene, elements=elements, **settings)
+        solution = solve(final.scene, elements=elements, **(settings | other))
         return solution, perf_counter() - start
 
     def gathered(solution: Solution) -> tuple[FloatArray, float]:
@@ -329,6 +330,9 @@ def _meshes(
         Ablation("mesh", f"{count:,} elements are enough", f"{2 * count:,} elements", base, longer + more, reached, 0.0)
     )
 
+    if settings["method"] == "matrix":
+        _matrix(found, solved, gathered, better[flat], flat, base, reached)
+
     def read(solution: Solution) -> float:
         lookup = ElementLookup.build(Geometry.from_scene(solution.scene), solution.mesh)
         element = lookup.elements(points[flat], polygons[flat], np.ones(int(flat.sum()), dtype=bool))
@@ -347,6 +351,26 @@ def _meshes(
             "mesh", "direct light is found at the point", f"read off {elements:,} elements", base, spent, reached, off
         )
     )
+
+
+def _matrix(
+    found: Explanation, solved: Callable[..., tuple[Solution, float]],
+    gathered: Callable[..., tuple[FloatArray, float]],
+    better: FloatArray, flat: NDArray[np.bool_], base: float, reached: float,
+) -> None:  # fmt: skip
+    """What the full matrix saves, and what better form factors would cost."""
+    asked = float(found.solution.record.settings["form_factor_error"])
+    others: list[tuple[str, str, dict[str, Any]]] = [
+        ("all form factors at once, pairs settled in groups", "column by column, from each receiver",
+         {"method": "progressive", "form_factor_error": None}),
+        (f"form factors to {asked:g}, as the error needs", f"form factors to {asked / 10:g}",
+         {"form_factor_error": asked / 10}),
+    ]  # fmt: skip
+    for decision, without, options in others:
+        solution, took = solved(**options)
+        values, more = gathered(solution)
+        off = relative_rms(values[flat], better)[0]
+        found.ablations.append(Ablation("form factors", decision, without, base, took + more, reached, off))
 
 
 # ---- the figure -------------------------------------------------------------------------------------
