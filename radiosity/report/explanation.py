@@ -82,15 +82,15 @@ class Explanation:
 
 
 def explain(
-    scene: Scene, *, error: float = 0.05, workers: int | None = None, seed: int = 0, repeats: int = 3,
-    report: Callable[[str], None] = lambda line: None,
+    scene: Scene, *, error: float = 0.05, method: str = "auto", workers: int | None = None, seed: int = 0,
+    repeats: int = 3, report: Callable[[str], None] = lambda line: None,
 ) -> Explanation:  # fmt: skip
     """Solve a scene to an error, say how, and switch each decision off in turn.
 
     Parameters
     ----------
     scene : Scene
-    error : float
+    error, method : float, str
         As in :func:`radiosity.solve`.
     workers : int, optional
     seed : int
@@ -105,7 +105,7 @@ def explain(
         As :func:`radiosity.solve`.
     """
     report("solving ...")
-    solution = solve(scene, error=error, workers=workers, seed=seed)
+    solution = solve(scene, error=error, method=method, workers=workers, seed=seed)
     found = Explanation(solution)
     geometry = Geometry.from_scene(scene)
     _mesh_facts(found, geometry, error)
