@@ -26,7 +26,7 @@ from workbench.scene.library import diffuse
 from workbench.scene.model import Camera, Scene, Surface
 
 SCENES = ("cornell-box", "office", "sculpture-room", "pots")
-ELEMENTS = {"cornell-box": 800, "office": 1500, "sculpture-room": 600, "pots": 1500}
+ELEMENTS = {"cornell-box": 800, "office": 1500, "sculpture-room": 600, "pots": 400}
 
 
 def pots() -> Scene:
