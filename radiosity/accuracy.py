@@ -29,7 +29,6 @@ from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, Solu
 from radiosity.solvers.solve import solve as solve_once
 from workbench.counters import Counters
 from workbench.errors import MemoryForecastError, OptionError
-from workbench.geometry.flat import Geometry
 from workbench.scene.model import Scene
 
 __all__ = ["ErrorEstimate", "solve", "surface_points"]
@@ -370,12 +369,14 @@ def _refine(
             stuck, count = stuck + 1, 2 * count
             continue
         begin = time.perf_counter()
+        if gatherer is None:
+            gatherer = Gatherer(solution, workers=run.options.get("workers"))
+        else:
+            gatherer = gatherer.reading(solution)
         if where is None:
             # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
-            where = surface_points(build_mesh(scene, Geometry.from_scene(scene)), POINTS)
-        if gatherer is None:
-            gatherer = Gatherer(solution, workers=run.options.get("workers"), seed=1)
-        seen = _look(gatherer.reading(solution), where, run)
+            where = surface_points(build_mesh(scene, gatherer.geometry), POINTS)
+        seen = _look(gatherer, where, run)
         mean = float(solution.mean_irradiance.mean())
         difference = None if run.seen is None else _relative_rms(seen - run.seen, mean)
         run.seen = seen
