@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from radiosity.interpolation import corner_values
 from workbench.errors import InputError, MissingLibraryError, OptionError
 from workbench.render.camera import PinholeRays
-from workbench.render.image import write_picture
+from workbench.render.image import srgb_bytes, write_picture
 from workbench.scene.model import Camera
 
 if TYPE_CHECKING:
@@ -174,13 +174,6 @@ def solution_camera(solution: Solution) -> Camera:
     return automatic_camera(solution.mesh, solution.radiosity, up=1 if y_up else 2)
 
 
-def _srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Linear 0..1 as sRGB bytes (IEC 61966-2-1)."""
-    linear = np.clip(linear, 0, 1)
-    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.rint(curve * 255).astype(np.uint8)
-
-
 def _white_level(luminance: NDArray[np.float64], emits: NDArray[np.bool_]) -> float:
     """The luminance shown as white: the 99th percentile of what is seen by reflected light is 0.8 of it.
 
@@ -249,7 +242,7 @@ def render_preview(
         linear[~hit] = np.minimum(background * np.pi / white, 1.0)  # radiance to the same scale as radiosity
     else:
         linear[~hit] = _BACKGROUND
-    return _srgb(_average(linear, camera, samples))
+    return srgb_bytes(_average(linear, camera, samples))
 
 
 def _average(samples_seen: NDArray[np.float64], camera: Camera, samples: int) -> NDArray[np.float64]:
