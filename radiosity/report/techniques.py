@@ -457,7 +457,8 @@ class Solve(Problem):
     what, question = "solve", "irradiance"
     error_label = "error: rms over the points / mean irradiance"
     own = (
-        "auto", "progressive", "progressive+gather", "hierarchical", "hierarchical+gather", "direct", "direct+gather",
+        "auto", "matrix", "matrix+gather", "progressive", "progressive+gather", "directional", "directional+gather",
+        "hierarchical", "hierarchical+gather", "direct", "direct+gather",
     )  # fmt: skip
     gather_share = 0.5
     """``auto``: share of the wanted error that is left to gathering."""
@@ -515,15 +516,17 @@ class Solve(Problem):
         counters.merge(found.counters)
         return found.irradiance, dict(counters)
 
-    def _meshed(self, name: str, method: str, values: tuple[int, ...], gather: bool) -> Technique:
+    def _meshed(self, name: str, method: str, values: tuple[int, ...], gather: bool, **more: Any) -> Technique:
         def ask(value: float, seed: int) -> Answer:
             # Finer meshes are worth better form factors, less light left and a better gather: a gathered mesh
             # of n elements is off by about 0.3 / sqrt(n).
             fine = 0.3 / math.sqrt(value)
-            options: dict[str, Any] = {"method": method, "elements": int(value)}
-            if method != "hierarchical":  # which chooses better for itself
+            options: dict[str, Any] = {"method": method, "elements": int(value)} | more
+            if method == "matrix":  # states the error of a row, the others that of a form factor
+                options["form_factor_error"] = 0.5 * fine
+            elif method != "hierarchical":  # which chooses better for itself
                 options["form_factor_error"] = min(2.0 * fine, 0.2)
-            if method != "direct":
+            if method not in ("direct", "matrix"):  # which know no light left unshot
                 options["tolerance"] = min(0.01, fine)
             solution = self._solved(options, seed)
             if not gather:
@@ -549,11 +552,23 @@ class Solve(Problem):
     def _hierarchical_gather(self) -> Technique:
         return self._meshed("hierarchical+gather", "hierarchical", (100, 200, 800, 3200), True)
 
+    def _matrix(self) -> Technique:
+        return self._meshed("matrix", "matrix", (100, 400, 1600), False)
+
+    def _matrix_gather(self) -> Technique:
+        return self._meshed("matrix+gather", "matrix", (16, 50, 200, 800, 2400), True)
+
     def _progressive(self) -> Technique:
         return self._meshed("progressive", "progressive", (100, 400, 1600), False)
 
     def _progressive_gather(self) -> Technique:
         return self._meshed("progressive+gather", "progressive", (16, 50, 200, 800), True)
+
+    def _directional(self) -> Technique:
+        return self._meshed("directional", "progressive", (100, 400, 1600), False, bundles="directional")
+
+    def _directional_gather(self) -> Technique:
+        return self._meshed("directional+gather", "progressive", (16, 50, 200), True, bundles="directional")
 
     def _direct(self) -> Technique:
         return self._meshed("direct", "direct", (50, 100, 200), False)

@@ -111,6 +111,32 @@ def test_solve_against_a_reference_of_ones_own(tmp_path):
     assert float(gathered["error"]) < 0.03 and float(coarse["error"]) < 0.3
 
 
+def test_every_technique_is_on_a_chart():
+    """The techniques of the three sources, the engine's own and every solver with and without a gather."""
+    expected = {
+        "shadows": {"voxel+rayID", "voxel+plane-vertex", "shaft", "adaptive", "exact", "camera", "camera-optimised",
+                    "rays", "auto", "mitsuba", "radiance", "trimesh"},
+        "viewfactors": {"bundle", "hemicube", "rays", "auto", "pyviewfactor", "trimesh"},
+        "solve": {f"{method}{gather}" for method in ("matrix", "progressive", "directional", "hierarchical", "direct")
+                  for gather in ("", "+gather")} | {"auto", "mitsuba", "radiance"},
+        "render": {"aliased", "adaptive", "atomic", "gather", "mitsuba", "radiance"},
+        "picture": {"gather", "mitsuba", "radiance"},
+    }  # fmt: skip
+    for what, names in expected.items():
+        assert names <= set(PROBLEMS[what].names()), what
+
+
+@pytest.mark.parametrize("method", ["matrix", "directional"])
+def test_solvers_agree_where_each_is_gathered(method):
+    """Two solvers that share no code for form factors find the light of the L-room within their errors."""
+    problem = problem_for("solve", load("l-room"), points=16)
+    judge = problem.technique("progressive+gather").ask(400, 3)
+    found = problem.technique(f"{method}+gather").ask(200, 3)
+    assert found.counters["rays" if method == "directional" else "exact_cuts"] > 0
+    assert np.abs(found.values - judge.values).mean() < 0.03 * judge.values.mean()
+    assert np.abs(problem.technique(method).ask(100, 3).values - judge.values).mean() < 0.3 * judge.values.mean()
+
+
 def test_every_technique_is_named_in_its_problem():
     for kind in PROBLEMS.values():
         assert len(set(kind.names())) == len(kind.names())
