@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from radiosity.shadow_command import GridSize
 from workbench.errors import InputError, OptionError
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ LIMIT = 5.0
     metavar="S",
     help="Leave out finer settings once a run took longer.  [seconds]",
 )
-@click.option("--grid", metavar="NxM", help="shadows: points on the surface.  [default: 48x48]")
+@click.option("--grid", type=GridSize(), help="shadows: points on the surface.  [default: 48x48]")
 @click.option("--surface", metavar="NAME", help="shadows: that surface.  [default: the largest that faces up]")
 @click.option("--points", type=click.IntRange(2, 1 << 20), metavar="N", help="solve: points.  [default: 256]")
 @click.option("--width", type=click.IntRange(4, 4096), metavar="PIXELS", help="render, picture: across.  [default: 96]")
@@ -68,7 +69,7 @@ def chart(
     repeats: int,
     seeds: int,
     limit: float,
-    grid: str | None,
+    grid: tuple[int, int] | None,
     surface: str | None,
     points: int | None,
     width: int | None,
@@ -92,9 +93,9 @@ def chart(
     join an old record.  Rivals (mitsuba, radiance, pyviewfactor, trimesh) are left out with a reason
     where they are not installed.  Lamps reflect nothing, in all techniques.
     """
-    from radiosity.shadow_command import _check_folder
+    from workbench.record import check_folder
 
-    _check_folder(directory)
+    check_folder(directory)
     import workbench
     from radiosity.report.speed_accuracy import measure, read_runs, scene_digest, write_runs
     from radiosity.report.techniques import problem_for
@@ -111,7 +112,7 @@ def chart(
         if value is not None:
             if name not in belongs:
                 raise OptionError(f"--{name}: found it with --what {what}, which has none; leave it out")
-            options[name] = _grid(str(value)) if name == "grid" else value
+            options[name] = value
     problem = problem_for(what, loaded, **options)
     names = _split(methods) if methods else list(problem.names())
     for name in names:
@@ -182,13 +183,6 @@ def tori_under_square_light() -> Scene:
 
 def _split(text: str) -> list[str]:
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-
-
-def _grid(text: str) -> tuple[int, int]:
-    from radiosity.shadow_command import _Grid
-
-    found = _Grid().convert(text, None, None)
-    return found[0], found[1]
 
 
 def _sweeps(given: Sequence[str]) -> dict[str, tuple[float, ...]]:

@@ -34,9 +34,9 @@ def explain(scene: str, error: float, repeats: int, seed: int, workers: int | No
     sampled, what the cullers set aside, rays.  Then the same work is done with each decision switched
     off.  DIR gets explain.csv, explain.png and record.json.
     """
-    from radiosity.shadow_command import _check_folder
+    from workbench.record import check_folder
 
-    _check_folder(directory)
+    check_folder(directory)
     import workbench
     from radiosity.report import cost_model, explanation
     from workbench.study.result import StudyResult, format_table, write_study

@@ -5,10 +5,8 @@ Only ``click`` is imported at the top; everything heavy is imported when the com
 
 from __future__ import annotations
 
-import os
 import re
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +18,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+    from radiosity.surface_grid import Sensors
     from workbench.geometry.flat import Geometry
     from workbench.scene.model import Scene
     from workbench.shadow.occlusion import OcclusionEstimate
 
-__all__ = ["shadow"]
+__all__ = ["GridSize", "shadow"]
 
 CONVERGED = 4096
 """Rays a point of the run that stands in for an exact one."""
@@ -34,7 +33,7 @@ STATES = (("not in shadow", "#f0e442"), ("in shadow", "#3b3b58"), ("complex", "#
 """The occlusion states, in their order, with colours that the colour-blind can tell apart."""
 
 
-class _Grid(click.ParamType):
+class GridSize(click.ParamType):
     """A number of points along two sides, such as 32x24."""
 
     name = "NxM"
@@ -66,7 +65,7 @@ class _Counts(click.ParamType):
 
 @click.command()
 @click.argument("scene")
-@click.option("--grid", type=_Grid(), help="Points on a flat surface.  [default: 32x32]")
+@click.option("--grid", type=GridSize(), help="Points on a flat surface.  [default: 32x32]")
 @click.option("--surface", metavar="NAME", help="That surface.  [default: the largest that faces up]")
 @click.option(
     "--points",
@@ -122,14 +121,14 @@ def shadow(
 
     Methods: adaptive, auto, camera, camera-optimised, exact, rays, rays+plane-vertex, shaft.
     """
+    from workbench.record import RunRecord, check_folder
+
     if points_path is not None and (grid is not None or surface is not None):
         raise OptionError("--points: found --grid or --surface as well, expected one of them; leave the other out")
     for path in (directory, Path(json_path).parent if json_path not in (None, "-") else None):
-        _check_folder(path)
+        check_folder(path)
     if json_path not in (None, "-") and Path(str(json_path)).is_dir():
         raise OptionError(f"--json: found the folder {json_path}, expected a file name")
-    from workbench.record import RunRecord
-
     record = RunRecord("shadow")
     with record.stage("read"):
         import workbench
@@ -145,6 +144,7 @@ def shadow(
         if name not in METHODS:
             raise OptionError(f"--method: found {name!r}, expected one or more of {', '.join(METHODS)}")
     with record.stage("prepare"):
+        from radiosity.surface_grid import read_points, surface_grid
         from workbench.geometry.flat import Geometry
 
         geometry = Geometry.from_scene(loaded)
@@ -182,26 +182,7 @@ def shadow(
             raise InputError(f"{json_path}: cannot be written: {problem.strerror or problem}") from None
 
 
-def _check_folder(path: Path | None) -> None:
-    """Refuse, before the work, a folder that cannot take files; leave no trace of the trial."""
-    made: list[Path] = []
-    try:
-        for folder in [*reversed(path.parents), path] if path is not None else []:
-            if not folder.exists():
-                folder.mkdir()
-                made.append(folder)
-        if path is not None:
-            probe = path / f".radiosity.{os.getpid()}.part"
-            probe.touch()
-            probe.unlink()
-    except OSError as problem:
-        raise InputError(f"{path}: cannot write here: {problem.strerror or problem}; give another folder") from None
-    finally:
-        for folder in reversed(made):
-            folder.rmdir()
-
-
-# ---- lights and points --------------------------------------------------------------------------
+# ---- lights -----------------------------------------------------------------------------------
 
 
 def _chosen_lights(scene: Scene, geometry: Geometry, name: str | None) -> list[Any]:
@@ -218,129 +199,6 @@ def _chosen_lights(scene: Scene, geometry: Geometry, name: str | None) -> list[A
         known = sorted({light.name for light in lights})
         raise OptionError(f"--light: found {name!r}, expected one of {', '.join(known[:8])}{' ...' * (len(known) > 8)}")
     return chosen
-
-
-@dataclass(frozen=True)
-class Sensors:
-    """Points to be shaded, and where they stand in a picture.
-
-    ``cells`` (n,) numbers the points inside a grid of ``shape`` (rows, columns) over ``extent``
-    (left, right, bottom, top); ``None`` for points that form no grid.
-    """
-
-    name: str
-    points: NDArray
-    normals: NDArray
-    own: NDArray
-    flat: NDArray
-    labels: tuple[str, str]
-    shape: tuple[int, int] | None = None
-    cells: NDArray | None = None
-    extent: tuple[float, float, float, float] | None = None
-
-
-def read_points(path: Path) -> Sensors:
-    """Points and normals from a file, see :func:`radiosity.points_file.read_sensor_points`.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or a line has other than six finite numbers.
-    """
-    import numpy as np
-
-    from radiosity.points_file import read_sensor_points
-
-    table = read_sensor_points(path)
-    spread = np.ptp(table[:, :3], axis=0)
-    first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
-    return Sensors(
-        path.name, table[:, :3], table[:, 3:], np.full(len(table), -1), table[:, [first, second]],
-        ("xyz"[first], "xyz"[second]),
-    )  # fmt: skip
-
-
-def surface_grid(scene: Scene, geometry: Geometry, name: str | None, shape: tuple[int, int]) -> Sensors:
-    """Points in the middle of the cells of a grid over a flat surface, as far as they lie on it.
-
-    Without a name: the surface with the largest area that faces up, along the coordinate axis
-    nearest to the camera's up, or z.
-
-    Raises
-    ------
-    InputError
-        If there is no such surface, it is not flat, or no point falls on it.
-    """
-    import numpy as np
-
-    from workbench.geometry.polygons import plane_basis
-
-    up = np.array([0.0, 0.0, 1.0])
-    if scene.camera is not None:
-        axis = int(np.argmax(np.abs(scene.camera.up)))
-        up = np.eye(3)[axis] * np.sign(scene.camera.up[axis])
-    area, normal = geometry.polygon_area, geometry.polygon_normal
-    if name is None:
-        twice = np.array([m.two_sided for m in geometry.surface_material], dtype=bool)[geometry.polygon_surface]
-        dark = np.array([not m.emission.any() for m in geometry.surface_material])[geometry.polygon_surface]
-        rise = normal @ up
-        facing = dark & ((rise > 0.9) | (twice & (rise < -0.9)))
-        if not facing.any():
-            raise InputError(f"{scene.name}: found no surface that faces up; give --surface NAME or --points FILE.csv")
-        sums = np.bincount(geometry.polygon_surface[facing], area[facing], minlength=len(geometry.surface_name))
-        chosen = int(np.argmax(sums))
-        mine = np.flatnonzero(facing & (geometry.polygon_surface == chosen))
-    else:
-        if name not in geometry.surface_name:
-            known = sorted(set(geometry.surface_name))
-            more = " ..." if len(known) > 8 else ""
-            raise OptionError(f"--surface: found {name!r}, expected one of {', '.join(known[:8])}{more}")
-        chosen = geometry.surface_name.index(name)
-        mine = np.flatnonzero(geometry.polygon_surface == chosen)
-        if not len(mine):
-            raise InputError(f"--surface: {name!r} has no polygons; give another")
-    # The flat part with the largest area: polygons of the plane of one of them.
-    lead_piece = geometry.polygon_piece_start[mine]
-    anchor = geometry.corners[geometry.piece_start[lead_piece]]
-    best: Any = mine[:0]
-    for lead in mine[np.argsort(-area[mine], kind="stable")[:16]]:
-        origin = geometry.corners[geometry.piece_start[geometry.polygon_piece_start[lead]]]
-        level = (normal[mine] @ normal[lead] > 1 - 1e-9) & (
-            np.abs((anchor - origin) @ normal[lead]) <= 1e-7 * geometry.size
-        )
-        if area[mine[level]].sum() > area[best].sum():
-            best = mine[level]
-    if area[best].sum() < 0.25 * area[mine].sum() and name is not None and len(mine) > 6:
-        raise InputError(f"--surface: {name!r} is not flat; give its points with --points FILE.csv")
-    front = normal[best[0]]
-    facing_up = front if name is not None or front @ up > 0 else -front
-    axes = [np.eye(3)[k] for k in range(3) if abs(facing_up[k]) < 1e-6]
-    u, v = (axes[0], axes[1]) if len(axes) == 2 else plane_basis(facing_up)
-    pieces = [k for polygon in best for k in range(*geometry.polygon_piece_start[[polygon, polygon + 1]])]
-    flat = [np.column_stack([geometry.piece(k) @ u, geometry.piece(k) @ v]) for k in pieces]
-    low, high = np.concatenate(flat).min(axis=0), np.concatenate(flat).max(axis=0)
-    columns, rows = shape
-    across = low[0] + (np.arange(columns) + 0.5) / columns * (high[0] - low[0])
-    along = low[1] + (np.arange(rows) + 0.5) / rows * (high[1] - low[1])
-    place = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
-    own = np.full(len(place), -1)
-    for k, ring in zip(pieces, flat, strict=True):
-        edge = np.roll(ring, -1, axis=0) - ring
-        gap = place[:, None] - ring
-        turn = edge[:, 0] * gap[..., 1] - edge[:, 1] * gap[..., 0]
-        inside = (turn >= 0).all(axis=1) | (turn <= 0).all(axis=1)
-        own[inside & (own < 0)] = geometry.piece_polygon[k]
-    cells = np.flatnonzero(own >= 0)
-    if not len(cells):
-        raise InputError(f"--grid: found no point of {columns}x{rows} on {geometry.surface_name[chosen]!r}; ask more")
-    depth = float(geometry.corners[geometry.piece_start[pieces[0]]] @ facing_up)
-    points = place[cells, :1] * u + place[cells, 1:] * v + depth * facing_up
-    labels = tuple("xyz"[int(np.argmax(w))] if w.max() == 1.0 else letter for w, letter in ((u, "u"), (v, "v")))
-    return Sensors(
-        f"{geometry.surface_name[chosen]!r}", points, np.repeat(facing_up[None], len(points), axis=0), own[cells],
-        place[cells], (labels[0], labels[1]), (rows, columns), cells,
-        (float(low[0]), float(high[0]), float(low[1]), float(high[1])),
-    )  # fmt: skip
 
 
 # ---- the runs and their table -------------------------------------------------------------------

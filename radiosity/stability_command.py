@@ -44,14 +44,14 @@ def stability(directory: Path | None, only: str | None, listing: bool) -> None:
     record.json.  The exit code is 1 if any cell is wrong.
     """
     from radiosity.report.failures import CATALOGUE
-    from radiosity.shadow_command import _check_folder
+    from workbench.record import check_folder
 
     chosen = _chosen(CATALOGUE, only)
     if listing:
         for entry, _ in chosen:
             click.echo(f"{entry.group:30s} {entry.name:36s} {entry.about}")
         return
-    _check_folder(directory)
+    check_folder(directory)
     from workbench.record import RunRecord
     from workbench.study.result import format_table
 

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from workbench.counters import Counters
+from workbench.errors import InputError
 
-__all__ = ["RunRecord", "write_text_atomically"]
+__all__ = ["RunRecord", "check_folder", "write_text_atomically"]
 
 _LIBRARIES = ("radiosity-workbench", "numpy", "scipy", "numba", "embreex", "trimesh", "pyvista", "vtk")
 
@@ -52,6 +53,31 @@ def write_text_atomically(path: str | Path, text: str) -> None:
         beside.replace(path)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def check_folder(path: Path | None) -> None:
+    """Refuse, before the work, a folder that cannot take files; leave no trace of the trial.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made, or no file can be written into it.
+    """
+    made: list[Path] = []
+    try:
+        for folder in [*reversed(path.parents), path] if path is not None else []:
+            if not folder.exists():
+                folder.mkdir()
+                made.append(folder)
+        if path is not None:
+            probe = path / f".radiosity.{os.getpid()}.part"
+            probe.touch()
+            probe.unlink()
+    except OSError as problem:
+        raise InputError(f"{path}: cannot write here: {problem.strerror or problem}; give another folder") from None
+    finally:
+        for folder in reversed(made):
+            folder.rmdir()
 
 
 @dataclass

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from radiosity.rivals import RIVALS, Rival, absent, open_rival
 from radiosity.rivals.base import black_lamps
+from radiosity.surface_grid import surface_grid
 from workbench.counters import Counters
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
@@ -166,7 +167,6 @@ class Shadows(Problem):
         surface: str | None = None,
         workers: int | None = None,
     ) -> None:
-        from radiosity.shadow_command import surface_grid
         from workbench.shadow.lights import lights_of_scene
         from workbench.shadow.occlusion import Shader
 

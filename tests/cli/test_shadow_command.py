@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from radiosity import cli
-from radiosity.shadow_command import read_points, surface_grid
+from radiosity.surface_grid import read_points, surface_grid
 from workbench.errors import InputError
 from workbench.geometry.flat import Geometry
 from workbench.scene.load import load
