@@ -220,8 +220,8 @@ def _mesh_triangle(tri: FloatArray, edge: float, split: int) -> _Part:
     return _Part([[cell] for cell in cells], patch, [[cell] for cell in coarse])
 
 
-def _grid_rows(rings: list[FloatArray], edge: float) -> tuple[FloatArray, FloatArray, FloatArray, int, int]:
-    """Frame along the longest edge, flat bounds and grid counts of any polygon."""
+def _grid_rows(rings: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Frame along the longest edge of any polygon, and its flat bounds: lowest corner and extent."""
     vector = vector_area(rings)
     normal = vector / np.linalg.norm(vector)
     sides = np.roll(rings[0], -1, axis=0) - rings[0]
@@ -229,82 +229,132 @@ def _grid_rows(rings: list[FloatArray], edge: float) -> tuple[FloatArray, FloatA
     u = u / np.linalg.norm(u) if np.linalg.norm(u) > 0 else plane_basis(normal)[0]
     frame = np.stack([u, np.cross(normal, u)])
     flat = (np.concatenate(rings) - rings[0][0]) @ frame.T
-    low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
-    return frame, low, extent, _steps(float(extent[0]), edge, 1), _steps(float(extent[1]), edge, 1)
+    return frame, flat.min(axis=0), np.ptp(flat, axis=0)
 
 
-def _mesh_polygon(rings: list[FloatArray], pieces: list[FloatArray], edge: float) -> _Part:
+def _mesh_polygon(rings: list[FloatArray], pieces: list[FloatArray], edge: float, split: int) -> _Part:
     """Any polygon: cells of a grid along its longest edge, cut by its outline."""
-    frame, low, extent, nu, nv = _grid_rows(rings, edge)
+    frame, low, extent = _grid_rows(rings)
+    nu, nv = (_steps(float(length), edge, split) for length in extent)
     if nu * nv == 1:
         return _Part([pieces], [0], [pieces])
     flat = [(ring - rings[0][0]) @ frame.T for ring in rings]
     outline = shapely.Polygon(flat[0], flat[1:])
+    shapely.prepare(outline)
     xs = low[0] + extent[0] * np.linspace(0, 1, nu + 1)
     ys = low[1] + extent[1] * np.linspace(0, 1, nv + 1)
-    boxes = shapely.box(*(a.ravel() for a in (*np.meshgrid(xs[:-1], ys[:-1]), *np.meshgrid(xs[1:], ys[1:]))))
-    cell = float(extent[0] * extent[1]) / (nu * nv)
+    grid = np.stack(np.meshgrid(xs, ys), axis=-1)
+    cells = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2).reshape(-1, 4, 2)
+    boxes = shapely.box(cells[:, 0, 0], cells[:, 0, 1], cells[:, 2, 0], cells[:, 2, 1])
+    least = 1e-6 * float(extent[0] * extent[1]) / (nu * nv)
     parts: list[list[FloatArray]] = []
-    for cut in shapely.intersection(boxes, outline):
-        for part in shapely.get_parts(cut):
-            if part.geom_type != "Polygon" or part.area <= 1e-6 * cell:
+    groups: dict[int, list[int]] = {}
+
+    def add(cell: int, part: list[FloatArray]) -> None:
+        j, i = divmod(cell, nu)
+        groups.setdefault((j // split) * nu + i // split, []).append(len(parts))
+        parts.append(part)
+
+    whole = shapely.covers(outline, boxes)
+    lifted = rings[0][0] + cells @ frame
+    for cell in range(len(boxes)):
+        if whole[cell]:
+            add(cell, [np.ascontiguousarray(lifted[cell])])
+            continue
+        for part in shapely.get_parts(shapely.intersection(boxes[cell], outline)):
+            if part.geom_type != "Polygon" or part.area <= least:
                 continue
             part = shapely.geometry.polygon.orient(part)
             loops = [np.asarray(part.exterior.coords)[:-1]] + [np.asarray(r.coords)[:-1] for r in part.interiors]
-            parts.append(convex_pieces([rings[0][0] + loop @ frame for loop in loops]))
-    return _Part(parts, list(range(len(parts))), parts)
+            add(cell, convex_pieces([rings[0][0] + loop @ frame for loop in loops]))
+    patch = np.empty(len(parts), dtype=np.int64)
+    for number, members in enumerate(groups.values()):
+        patch[members] = number
+    senders = [[piece for k in members for piece in parts[k]] for members in groups.values()]
+    return _Part(parts, patch.tolist(), senders)
 
 
-def _polygon_count(rings: list[FloatArray], edge: float, split: int) -> int:
-    if len(rings) == 1 and len(rings[0]) == 3:
-        return _triangle_count(rings[0], edge, split) ** 2
-    if len(rings) == 1 and len(rings[0]) == 4:
-        nu, nv = _quad_counts(rings[0], edge, split)
-        return nu * nv
-    _, _, extent, nu, nv = _grid_rows(rings, edge)
-    covered = float(np.linalg.norm(vector_area(rings))) / float(extent[0] * extent[1])
-    return max(1, math.ceil(covered * nu * nv))
+@dataclass(frozen=True)
+class _Extents:
+    """What decides into how many elements the polygons of a surface fall.
+
+    Quads and other polygons fall into ``share`` of the cells of a grid over ``along`` x ``across``; of triangles,
+    whose ``across`` is 0, ``along`` is the longest edge.
+    """
+
+    along: FloatArray
+    across: FloatArray
+    share: FloatArray
+
+    @classmethod
+    def of_surface(cls, surface: Surface) -> _Extents:
+        """Measure every polygon once."""
+        sizes = np.diff(surface.ring_offsets)
+        if len(sizes) == surface.face_count and (sizes == sizes[0]).all() and sizes[0] in (3, 4):
+            ring = surface.vertices[surface.ring_vertices].reshape(len(sizes), sizes[0], 3)
+            side = np.linalg.norm(np.roll(ring, -1, axis=1) - ring, axis=2)
+            if sizes[0] == 3:
+                return cls(side.max(axis=1), np.zeros(len(sizes)), np.ones(len(sizes)))
+            return cls(np.maximum(side[:, 0], side[:, 2]), np.maximum(side[:, 1], side[:, 3]), np.ones(len(sizes)))
+        rows = []
+        for rings in surface.faces():
+            if len(rings) == 1 and len(rings[0]) in (3, 4):
+                side = np.linalg.norm(np.roll(rings[0], -1, axis=0) - rings[0], axis=1)
+                triangle = len(side) == 3
+                rows.append((side.max(), 0.0, 1.0) if triangle else (max(side[0], side[2]), max(side[1], side[3]), 1.0))
+            else:
+                extent = _grid_rows(rings)[2]
+                rows.append((*extent, float(np.linalg.norm(vector_area(rings)) / (extent[0] * extent[1]))))
+        return cls(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    def counts(self, edge: float, split: int) -> IntArray:
+        """About how many elements each polygon falls into."""
+
+        def steps(length: FloatArray) -> FloatArray:
+            count = np.maximum(1.0, np.ceil(length / edge - 1e-9))
+            return np.where(count > 1, split * np.ceil(count / split), count)
+
+        along = steps(self.along)
+        across = np.where(self.across > 0, steps(self.across), along)
+        return np.maximum(1, np.ceil(self.share * along * across)).astype(np.int64)
 
 
-def forecast_elements(scene: Scene, edge: float, split: int = 2) -> int:
+def forecast_elements(scene: Scene, edge: float, split: int = 2, extents: list[_Extents] | None = None) -> int:
     """About how many elements :func:`build_mesh` makes for a largest edge, without making them."""
     total = 0
-    for surface in scene.surfaces:
+    for number, surface in enumerate(scene.surfaces):
         sides = 2 if surface.material.two_sided else 1
-        sizes = np.diff(surface.ring_offsets)
-        if len(sizes) == surface.face_count and (sizes == 3).all():
-            tri = surface.vertices[surface.ring_vertices].reshape(-1, 3, 3)
-            longest = np.linalg.norm(np.roll(tri, -1, axis=1) - tri, axis=2).max(axis=1)
-            n = np.maximum(1, np.ceil(longest / edge - 1e-9))
-            n = np.where(n > 1, split * np.ceil(n / split), 1) ** 2
-            small = small_facets(surface, edge)
-            if len(small):
-                n[small] = 0
-                vector = np.cross(tri[small, 1] - tri[small, 0], tri[small, 2] - tri[small, 0])
-                area = 0.5 * np.linalg.norm(vector, axis=1)
-                normal = vector / np.maximum(2.0 * area, 1e-300)[:, None]
-                cell = min(edge, math.sqrt(float(area.sum()) / COARSE_CLUSTERS))
-                key = _cluster_keys(tri[small].mean(axis=1), normal, cell)
-                # One number a key: the count of distinct ones is all that is asked.
-                low, span = key.min(axis=0), np.ptp(key, axis=0) + 1
-                total += sides * len(np.unique(((key - low) * np.cumprod([1, *span[:-1]])).sum(axis=1)))
-            total += sides * int(n.sum())
-        else:
-            total += sides * sum(_polygon_count(rings, edge, split) for rings in surface.faces())
+        if not surface.face_count:
+            continue
+        n = (extents[number] if extents is not None else _Extents.of_surface(surface)).counts(edge, split)
+        small = small_facets(surface, edge) if (np.diff(surface.ring_offsets) == 3).all() else ()
+        if len(small):
+            n[small] = 0
+            tri = surface.vertices[surface.ring_vertices].reshape(-1, 3, 3)[small]
+            vector = np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0])
+            area = 0.5 * np.linalg.norm(vector, axis=1)
+            normal = vector / np.maximum(2.0 * area, 1e-300)[:, None]
+            cell = min(edge, math.sqrt(float(area.sum()) / COARSE_CLUSTERS))
+            key = _cluster_keys(tri.mean(axis=1), normal, cell)
+            # One number a key: the count of distinct ones is all that is asked.
+            low, span = key.min(axis=0), np.ptp(key, axis=0) + 1
+            total += sides * len(np.unique(((key - low) * np.cumprod([1, *span[:-1]])).sum(axis=1)))
+        total += sides * int(n.sum())
     return total
 
 
 def _edge_for(scene: Scene, geometry: Geometry, elements: int, split: int) -> float:
     """Largest edge that gives about the asked number of elements, by bisection."""
+    extents = [_Extents.of_surface(surface) for surface in scene.surfaces]
     high = 2.0 * geometry.size
-    if forecast_elements(scene, high, split) >= elements:
+    if forecast_elements(scene, high, split, extents) >= elements:
         return math.inf
     low = math.sqrt(float(geometry.polygon_area.sum()) / (4.0 * elements))
-    while forecast_elements(scene, low, split) < elements and low > 1e-6 * geometry.size:
+    while forecast_elements(scene, low, split, extents) < elements and low > 1e-6 * geometry.size:
         low *= 0.5
     for _ in range(40):
         middle = math.sqrt(low * high)
-        if forecast_elements(scene, middle, split) > elements:
+        if forecast_elements(scene, middle, split, extents) > elements:
             low = middle
         else:
             high = middle
@@ -437,7 +487,7 @@ def build_mesh(
             elif len(loops) == 1 and len(loops[0]) == 4 and len(pieces) == 1:
                 part = _mesh_quad(loops[0], edge, split)
             else:
-                part = _mesh_polygon(loops, pieces, edge)
+                part = _mesh_polygon(loops, pieces, edge, split)
             for sign in sides:
                 base = len(senders)
                 rings.extend([loop[::sign] for loop in element] for element in part.elements)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import json
 import os
@@ -22,6 +23,7 @@ __all__ = ["RunRecord", "check_folder", "write_text_atomically"]
 _LIBRARIES = ("radiosity-workbench", "numpy", "scipy", "numba", "embreex", "trimesh", "pyvista", "vtk")
 
 
+@functools.cache
 def _versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for name in _LIBRARIES:
@@ -96,7 +98,7 @@ class RunRecord:
     errors: dict[str, Any] = field(default_factory=dict)
     choices: dict[str, str] = field(default_factory=dict)
     results: dict[str, Any] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=_versions)
+    versions: dict[str, str] = field(default_factory=lambda: dict(_versions()))
     machine: dict[str, Any] = field(default_factory=_machine)
 
     @contextmanager

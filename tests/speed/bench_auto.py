@@ -21,6 +21,7 @@ from workbench.study.result import format_table
 
 PLAN = [
     ("auto", (0.1, 0.05)),
+    ("matrix+gather", (16, 50, 150, 400)),
     ("progressive+gather", (16, 50, 150, 400)),
     ("hierarchical+gather", (100, 200, 400, 800)),
 ]
@@ -28,7 +29,8 @@ PLAN = [
 
 def rows_of(scene: str, folder: Path, repeats: int) -> list[dict]:
     problem = problem_for("solve", workbench.load(scene), points=128)
-    fine = problem._solved({"method": "progressive", "elements": 3000, "tolerance": 2e-3}, 1)
+    small = problem.geometry.polygon_count <= 2000
+    fine = problem._solved({"method": "matrix" if small else "progressive", "elements": 3000, "tolerance": 2e-3}, 1)
     judge = Reference("3,000 elements", problem._gathered(fine, 0.003, 1)[0], 0.0, 0.003)
     runs, notes = measure(problem, judge, PLAN, repeats=repeats, limit=20.0)
     folder.mkdir(parents=True, exist_ok=True)
