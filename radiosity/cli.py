@@ -117,7 +117,7 @@ def main() -> None:
 )
 @click.option(
     "--method",
-    type=click.Choice(["auto", "progressive", "direct", "hierarchical"]),
+    type=click.Choice(["auto", "progressive", "direct", "matrix", "hierarchical"]),
     default="auto",
     show_default=True,
     help="Solver.",

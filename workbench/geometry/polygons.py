@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 
 from workbench.errors import InputError
 
-__all__ = ["are_convex", "check_polygon", "convex_pieces", "fan_triangles", "is_convex", "plane_basis", "vector_area"]
+__all__ = [
+    "are_convex",
+    "check_polygon",
+    "convex_pieces",
+    "fan_triangles",
+    "is_convex",
+    "plane_basis",
+    "triangulate_ring",
+    "vector_area",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -123,3 +132,15 @@ def convex_pieces(rings: Sequence[FloatArray]) -> list[FloatArray]:
     keep = np.abs(signed) > 1e-14 * area
     corners[signed < 0] = corners[signed < 0][:, ::-1]
     return [np.ascontiguousarray(corner) for corner in corners[keep]]
+
+
+def triangulate_ring(ring: FloatArray, normal: FloatArray) -> NDArray[np.int64]:
+    """Triangles (t, 3) of a ring (n, 3) that need not be planar, cut in its projection along the unit ``normal``."""
+    u, v = plane_basis(normal)
+    moved = ring - ring[0]
+    flat = np.column_stack([moved @ u, moved @ v])
+    triangles = mapbox_earcut.triangulate_float64(flat, np.asarray([len(ring)], dtype=np.uint32)).reshape(-1, 3)
+    corners = ring[triangles]
+    turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ normal < 0
+    triangles[turned] = triangles[turned][:, ::-1]
+    return triangles.astype(np.int64)

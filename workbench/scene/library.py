@@ -15,6 +15,7 @@ from workbench.geometry.tessellation import sphere_mesh
 from workbench.scene.model import Material, Scene, Sphere, Surface
 
 __all__ = [
+    "BOX_QUADS",
     "BOX_SIDES",
     "box_surface",
     "closed_scene_gaps",
@@ -36,7 +37,7 @@ BOX_SIDES = ("-x", "+x", "-y", "+y", "-z", "+z")
 
 # Corner i of a box has bit 0 for x, bit 1 for y, bit 2 for z; each side runs counter-clockwise
 # seen from outside, in the order of BOX_SIDES.
-_BOX_QUADS = np.array([[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]])
+BOX_QUADS = np.array([[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]])
 
 
 def diffuse(name: str, reflectance: ArrayLike, emission: ArrayLike = 0.0, *, bands: int = 1) -> Material:
@@ -75,7 +76,7 @@ def box_surface(
     if unknown or len(set(omit)) == 6:
         raise InputError(f"box: found omit {list(omit)}, expected some of {', '.join(BOX_SIDES)}, not all")
     bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
-    quads = _BOX_QUADS[[side not in omit for side in BOX_SIDES]]
+    quads = BOX_QUADS[[side not in omit for side in BOX_SIDES]]
     return Surface.from_mesh(name, material, np.where(bits, high, low), quads[:, ::-1] if inward else quads)
 
 

@@ -23,6 +23,7 @@ _READERS = {
     ".gltf": _MESH,
     ".sc": "workbench.scene.sc",
     ".nff": "workbench.scene.nff",
+    ".rad": "workbench.scene.rad",
 }
 SUFFIXES = tuple(_READERS)
 """Suffixes of the files that :func:`load` reads."""
@@ -69,6 +70,7 @@ def load(path: str | Path) -> Scene:
     See Also
     --------
     workbench.scene.toml : the native format.
+    workbench.scene.rad : what becomes of Radiance files.
     workbench.scene.mesh : what becomes of OBJ, PLY, STL, GLB and glTF files.
     """
     path = Path(path)

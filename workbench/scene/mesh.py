@@ -36,18 +36,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
 from workbench.errors import SceneError
 from workbench.geometry.flat import Geometry
-from workbench.geometry.polygons import PLANARITY, plane_basis
+from workbench.geometry.polygons import PLANARITY, triangulate_ring
 from workbench.scene.library import rings_cross
 from workbench.scene.model import Light, Material, Scene, Surface
 
-__all__ = ["MESH_SUFFIXES", "MeshSurfaces", "load_scene", "read_mesh"]
+__all__ = ["MESH_SUFFIXES", "MeshSurfaces", "lit", "load_scene", "read_mesh"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -397,18 +396,6 @@ def _unique(name: str, taken: Any) -> str:
     return candidate
 
 
-def _triangulate(points: FloatArray, normal: FloatArray) -> IntArray:
-    """Triangles (t, 3) of a ring that is not planar, cut in its projection along ``normal``."""
-    u, v = plane_basis(normal)
-    moved = points - points[0]
-    flat = np.column_stack([moved @ u, moved @ v])
-    triangles = mapbox_earcut.triangulate_float64(flat, np.asarray([len(points)], dtype=np.uint32)).reshape(-1, 3)
-    corners = points[triangles]
-    turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ normal < 0
-    triangles[turned] = triangles[turned][:, ::-1]
-    return triangles.astype(np.int64)
-
-
 def _clean(part: _Part, path: Path, notes: Counter[str]) -> _Part | None:
     """Faces with area, planar ones whole, others as triangles; ``None`` if nothing is left."""
     starts = np.cumsum(part.sizes) - part.sizes
@@ -441,7 +428,7 @@ def _clean(part: _Part, path: Path, notes: Counter[str]) -> _Part | None:
                 kept.append((int(faces[k]), rings[k]))
             else:
                 notes["faces that are not planar were cut into triangles"] += 1
-                kept.extend((int(faces[k]), rings[k][corner]) for corner in _triangulate(points[k], normal[k]))
+                kept.extend((int(faces[k]), rings[k][corner]) for corner in triangulate_ring(points[k], normal[k]))
     kept.sort(key=lambda item: item[0])
     _, weld = np.unique(part.vertices, axis=0, return_inverse=True)
     weld = weld.ravel()
@@ -574,13 +561,7 @@ def read_mesh(path: str | Path) -> MeshSurfaces:
 
 
 def load_scene(path: str | Path) -> Scene:
-    """A mesh file as a scene of three bands, without a camera.
-
-    A file that emits nothing is given light, and a note says so: a uniform sky of radiance 1/pi,
-    under which an open horizontal surface has an irradiance of 1 W/m2, and a sun of 1 W/m2 from above
-    and one side, without which open shapes would look flat; or, where the fronts see
-    no sky (a closed room), an isotropic point light in the roomiest place found, whose flux in W
-    equals the area of the surfaces, so that their mean direct irradiance is 1 W/m2.
+    """A mesh file as a scene of three bands, without a camera; :func:`lit` if nothing in it emits.
 
     Raises
     ------
@@ -597,11 +578,17 @@ def load_scene(path: str | Path) -> Scene:
         path=path,
         notes=mesh.notes,
     )
-    return scene if scene.has_emitter else _lit(scene)
+    return scene if scene.has_emitter else lit(scene)
 
 
-def _lit(scene: Scene) -> Scene:
-    """The scene with a sky, or with a point light if its fronts see none."""
+def lit(scene: Scene) -> Scene:
+    """A scene that emits nothing, given light, and a note that says so.
+
+    It gets a uniform sky of radiance 1/pi, under which an open horizontal surface has an irradiance of
+    1 W/m2, and a sun of 1 W/m2 from above and one side, without which open shapes would look flat; or,
+    where the fronts see no sky (a closed room), an isotropic point light in the roomiest place found, whose
+    flux in W equals the area of the surfaces, so that their mean direct irradiance is 1 W/m2.
+    """
     import trimesh
 
     geometry = Geometry.from_scene(scene)

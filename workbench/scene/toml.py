@@ -33,7 +33,8 @@ A value of bands is one number for all bands or a list with one for each.  A sha
               knots = [[...], [...]] (clamped and uniform unless given), segments = [16, 16],
               flip = false (the front is the side of du x dv)}
     torus_knot = {p = 2, q = 3, radius = 1, tube = 0.2, segments = 480, sides = 24}
-    mesh = "file"                   # beside the scene file; its own materials unless `material`
+    mesh = "file"                   # beside the scene file; its own materials unless `material`; of a
+                                    # Radiance file (.rad) the surfaces, not its distant sources
 
 ``transform`` is a list of steps, applied in the order in which they are listed: ``{translate = [x, y, z]}``,
 ``{rotate = {axis = [x, y, z], degrees = a}}`` (counter-clockwise seen from the axis' end, about
@@ -63,7 +64,7 @@ import typing
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,9 @@ from workbench.geometry.polygons import vector_area
 from workbench.scene._tokens import LARGEST, LARGEST_SIDE, read_text
 from workbench.scene.library import box_surface, polygon_fault, sphere_surface, torus_knot_mesh, transformed
 from workbench.scene.model import SKY_KINDS, Camera, Light, Material, Scene, Sky, Surface
+
+if TYPE_CHECKING:
+    from workbench.scene.mesh import MeshSurfaces
 
 __all__ = ["load_scene", "read_toml"]
 
@@ -634,10 +638,17 @@ class _Builder:
         )
 
     def _mesh(self, table: _SurfaceTable, file: str, key: Key) -> list[Surface]:
-        from workbench.scene.mesh import read_mesh
-
+        path = self.path.parent / file
+        mesh: MeshSurfaces | Scene
         try:
-            mesh = read_mesh(self.path.parent / file)
+            if file.lower().endswith(".rad"):
+                from workbench.scene.rad import read_rad
+
+                mesh = read_rad(path)
+            else:
+                from workbench.scene.mesh import read_mesh
+
+                mesh = read_mesh(path)
         except SceneError as error:
             self.fail((*key, "mesh"), str(error))
         self.notes.extend(f"{table.name}: {note}" for note in mesh.notes)
