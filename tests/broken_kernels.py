@@ -15,10 +15,11 @@ from workbench.shadow import occlusion, silhouette, woo
 
 _LINES = [(silhouette, "line_tiles"), (occlusion, "line_tiles")]
 _CALLERS = {
-    (silhouette, "_cross"): _LINES,
-    (silhouette, "_face"): _LINES,
-    (silhouette, "_loose_ring"): _LINES,
-    (silhouette, "_reaches"): _LINES,
+    (silhouette, "_cross"): [(silhouette, "_look"), *_LINES],
+    (silhouette, "_face"): [(silhouette, "_look"), *_LINES],
+    (silhouette, "_loose_ring"): [(silhouette, "_look"), *_LINES],
+    (silhouette, "_reaches"): [(silhouette, "_look"), *_LINES],
+    (silhouette, "_blurred"): _LINES,
     (silhouette, "_misses"): [(silhouette, "_tile_edges"), (silhouette, "_narrow"), *_LINES],
     (voxel_grid, "_outside_a_plane"): [(voxel_grid, "walk"), (woo, "walk"), (woo, "_shoot"), (woo, "_light_loop")],
     (voxel_grid, "walk"): [(voxel_grid, "walk"), (voxel_grid, "_trace")],

@@ -38,6 +38,7 @@ MEANINGS: dict[str, str] = {
     "exact_overflows": "exact cuts given up for rays because too many pieces appeared",
     "silhouette_edges": "edges projected from a point onto a sender, to see where its layers of occluders change",
     "sender_lines": "lines over a sender, each cut by the silhouettes before it",
+    "fitted_points": "point-sender pairs whose visible share is a fit to those of their neighbours",
     "camera_renders": "pictures drawn by hardware cameras, one a point and light",
     "camera_polygons": "polygons drawn into the pictures of hardware cameras and hemicubes",
     "camera_fallbacks": "point-sender pairs that no camera sees well, left to another method",

@@ -28,6 +28,7 @@ TALLY = (
     "links",
     "silhouette_edges",
     "sender_lines",
+    "fitted_points",
 )
 """Name of each row."""
 
@@ -50,6 +51,7 @@ TALLY = (
     LINK,
     EDGES,
     LINES,
+    FITTED,
 ) = range(len(TALLY))
 
 

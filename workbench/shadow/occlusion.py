@@ -607,15 +607,15 @@ class Shader:
         edges = self._edges
         frame = SenderFrame.build(self.geometry, edges, ring, normal)
         tree = self._tree
-        sender = (ring, ring.min(axis=0), ring.max(axis=0), normal, own)
+        sender = (ring, ring.min(axis=0), ring.max(axis=0), normal, own, frame.width)
         table = (
             self.geometry.piece_start, owners, self._through, edges.vertex, edges.edge, edges.ends, edges.piece,
             edges.turn,
         )  # fmt: skip
         axes = (frame.origin, frame.axes, frame.ring, frame.place, frame.plane, frame.height)
         spread = (
-            tiles.points, tiles.normals, tiles.order, tiles.own, tiles.start, tiles.bounds, tiles.normal, tiles.offset,
-            tiles.polygon,
+            tiles.points, tiles.normals, tiles.order, tiles.own, tiles.flat, tiles.start, tiles.bounds, tiles.normal,
+            tiles.offset, tiles.polygon,
         )  # fmt: skip
 
         def draw(chosen: IntArray, answer: _Settled, fewest: int, most: int, allowed: float, rays: int) -> None:

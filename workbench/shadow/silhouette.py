@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 
 from workbench.accel.box_tree import boxes_meeting_planes
 from workbench.culling.shaft import MAX_SHAFT_PLANES, tile_shaft
-from workbench.culling.tally import CLEAR, COMPLEX, DARK, EDGES, EMPTY, LINES, SHAFT
+from workbench.culling.tally import CLEAR, COMPLEX, DARK, EDGES, EMPTY, FITTED, LINES, SHAFT
 from workbench.geometry.flat import Geometry
 from workbench.geometry.planes import clip_by_plane
 from workbench.shadow._settle import STATE_CLEAR, STATE_COMPLEX, STATE_DARK, STATE_SAMPLED
+from workbench.shadow._tile_fit import NODE_GAP, NODES, TERMS, cubic_at, cut_runs, fit_cubic, pick_nodes, quarter
 from workbench.shadow.rays import shift
 from workbench.shadow.tiles import DIFFERENT
 
@@ -49,6 +50,14 @@ SURE = 1.5
 MAX_LINES = 1024
 GROUP, PART = 64, 16
 """Neighbouring points that share a list of edges, and of those that do where the list is long."""
+FEW = 40
+"""Points of a region to which nothing is fitted."""
+NODE_NOISE = 0.5
+"""Error of the shares that are fitted, as a share of the allowed one."""
+FIT_MARGIN = 1.0
+"""Most by which a fit may be off, as a share of the allowed error."""
+BLUR = 0.5
+"""Share of the sender's width by which edges may move over it from one node of a fit to the next."""
 CROWDED = 512
 """Edges that make a list long."""
 EDGES_A_RAY = 8
@@ -126,6 +135,14 @@ class EdgeTable:
         )
 
 
+def _width(ring: FloatArray, normal: FloatArray) -> float:
+    """Least distance of parallel lines that a convex polygon lies between."""
+    sides = np.roll(ring, -1, axis=0) - ring
+    across = np.cross(normal, sides[np.linalg.norm(sides, axis=1) > 0.0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return float(np.ptp(across @ ring.T, axis=1).min())
+
+
 @dataclass(frozen=True)
 class SenderFrame:
     """A geometry in the frame of a flat sender: x along the lines, y across them, z its normal.
@@ -143,6 +160,8 @@ class SenderFrame:
         Plane of each piece: normal and offset.
     height : (p, 2) float
         Lowest and highest z of each piece.
+    width : float
+        Least width of the sender.
     """
 
     origin: FloatArray
@@ -151,6 +170,7 @@ class SenderFrame:
     place: FloatArray
     plane: FloatArray
     height: FloatArray
+    width: float
 
     @classmethod
     def build(cls, geometry: Geometry, edges: EdgeTable, ring: FloatArray, normal: FloatArray) -> SenderFrame:
@@ -176,6 +196,7 @@ class SenderFrame:
             np.column_stack([np.minimum.reduceat(height, first), np.maximum.reduceat(height, first)])
             if len(first)
             else np.empty((0, 2)),
+            _width(ring, normal),
         )
 
 
@@ -192,17 +213,16 @@ def _side(plane, box):
 
 @njit(nogil=True, cache=True)
 def _reach(v, box, reach):
-    """Where on the sender's plane a vertex may be seen from the points of a box: least x, least and greatest y."""
+    """Where on the sender's plane a vertex may be seen from the points of a box: bounds of x, of y."""
     least = lowest = np.inf
-    highest = -np.inf
+    most = highest = -np.inf
     for i in range(2):
         r = box[i, 2] / (box[i, 2] - v[2])
         for j in range(2):
-            y = v[1] * r + box[j, 1] * (1.0 - r)
-            least = min(least, v[0] * r + box[j, 0] * (1.0 - r))
-            lowest = min(lowest, y)
-            highest = max(highest, y)
-    reach[0], reach[1], reach[2] = least, lowest, highest
+            x, y = v[0] * r + box[j, 0] * (1.0 - r), v[1] * r + box[j, 1] * (1.0 - r)
+            least, most = min(least, x), max(most, x)
+            lowest, highest = min(lowest, y), max(highest, y)
+    reach[0], reach[1], reach[2], reach[3] = least, most, lowest, highest
 
 
 @njit(nogil=True, cache=True)
@@ -349,6 +369,36 @@ def _bounds(places, first, last, box):
 
 
 @njit(nogil=True, cache=True)
+def _bounds_of(places, rows, a, b, first, box):
+    """Bounds of the places of ``rows[a:b]``, which are numbered from ``first``."""
+    for axis in range(3):
+        low, high = np.inf, -np.inf
+        for k in range(a, b):
+            x = places[rows[k] - first, axis]
+            low, high = min(low, x), max(high, x)
+        box[0, axis], box[1, axis] = low, high
+
+
+@njit(nogil=True, cache=True)
+def _blurred(box, highest, ring_box, width):
+    """Whether edges no nearer than ``highest`` are blurred over more than the distance of a region's nodes.
+
+    From a point at height h an edge at height z moves over the sender z / (h - z) times as fast as the
+    point does along it; what moves by less than the sender's width from node to node none of them can miss.
+    """
+    near = box[0, 2]
+    gap = near - highest
+    if gap <= 0.0:
+        return False
+    step = NODE_GAP * max(box[1, 0] - box[0, 0], box[1, 1] - box[0, 1])
+    rise = NODE_GAP * (box[1, 2] - near)
+    aside = 0.0
+    for axis in range(2):
+        aside = max(aside, box[1, axis] - ring_box[0, axis], ring_box[1, axis] - box[0, axis])
+    return max(highest, 0.0) * (step + rise * aside / near) <= BLUR * width * gap
+
+
+@njit(nogil=True, cache=True)
 def _misses(a, b, place, box, ring_box, mark, vertex_mark, reach):
     """Whether no point of a box sees the edge a-b on a line's sender or left of it."""
     for v in (a, b):
@@ -357,8 +407,8 @@ def _misses(a, b, place, box, ring_box, mark, vertex_mark, reach):
             _reach(place[v], box, reach[v])
     return (
         min(reach[a, 0], reach[b, 0]) >= ring_box[1, 0]
-        or min(reach[a, 1], reach[b, 1]) >= ring_box[1, 1]
-        or max(reach[a, 2], reach[b, 2]) <= ring_box[0, 1]
+        or min(reach[a, 2], reach[b, 2]) >= ring_box[1, 1]
+        or max(reach[a, 3], reach[b, 3]) <= ring_box[0, 1]
     )
 
 
@@ -407,13 +457,17 @@ def _tile_edges(pieces, box, ring_box, table, frame, mark, marks, out):
 
 @njit(nogil=True, cache=True)
 def _narrow(count, wide, box, ring_box, table, frame, mark, tile_mark, owned, marks, out):
-    """Of the edges ``wide`` of a box those that matter to the points of a smaller one; their number."""
+    """Of the edges ``wide`` of a box those that matter to the points of a smaller one.
+
+    Returns their number, and the greatest z of those that may be seen before the sender.
+    """
     _, piece_polygon, _, _, _, ends, _, turn = table
     place, plane = frame[3], frame[4]
     piece_mark, piece_class, _, vertex_mark, _, reach = marks
     wide_edge, wide_base, wide_unsettled = wide
     which, base_of, unsettled = out
     kept = 0
+    nearest = -np.inf
     for c in range(count):
         e = wide_edge[c]
         base, unsure = wide_base[c], False
@@ -436,7 +490,10 @@ def _narrow(count, wide, box, ring_box, table, frame, mark, tile_mark, owned, ma
             continue
         which[kept], base_of[kept] = e, base
         kept += 1
-    return kept
+        v, w = ends[e, 0], ends[e, 1]
+        if max(reach[v, 1], reach[w, 1]) > ring_box[0, 0]:
+            nearest = max(nearest, place[v, 2], place[w, 2])
+    return kept, nearest
 
 
 @njit(nogil=True, cache=True)
@@ -551,18 +608,125 @@ def _loose_ring(p, starts, vertex, place, top, cut, cut2):
 
 
 @njit(nogil=True, cache=True)
+def _look(
+    px, py, h, nx, ny, nz, own, offset, fewest, most, allowed, ring, group, sizes, frame, table, loose, various,
+    scratch, tally,
+):  # fmt: skip
+    """The hidden share of the sender from one point, and its error; what is certain of it comes first.
+
+    Returns CLEAR or DARK where no silhouette lies before the sender, SAMPLED where some does, and
+    COMPLEX where the lines could not be drawn.  ``group`` holds the edges to look at, ``sizes`` how many
+    there are, ``loose`` the pieces that reach the sender's plane or the point's height.
+    """
+    starts, piece_polygon, _, vertex, _, _, _, _ = table
+    _, _, _, place, plane, height = frame
+    group_edge, group_vertex, group_piece, group_plane = group
+    edges, settled, spots, unsure = sizes
+    lit, lit_box, cut, cut2, left, right, before, many, where, steps, hidden, over, line, row, facing = scratch
+    corners_lit = _clip_ring(ring, nx, ny, nx * px + ny * py + nz * h, lit)
+    if corners_lit < 3:
+        return STATE_COMPLEX, 0.0, 0.0
+    _bounds(lit, 0, corners_lit, lit_box)
+    if not lit_box[1, 1] > lit_box[0, 1]:
+        return STATE_COMPLEX, 0.0, 0.0
+    _face(group_plane, unsure, px, py, h, facing)
+    if various:
+        for c in range(unsure):
+            if piece_polygon[group_piece[c]] == own:
+                facing[c] = 0
+    lines = fewest
+    meets = fits = True
+    while True:
+        dy = (lit_box[1, 1] - lit_box[0, 1]) / lines
+        y0 = lit_box[0, 1] + offset * dy
+        _lay_lines(lit, corners_lit, lines, y0, dy, left, right)
+        for k in range(lines):
+            before[k] = many[k] = 0
+        _project(group_vertex, spots, px, py, h, y0, dy, lines, over, line, row)
+        for c in range(settled):
+            a, b = group_edge[c, 0], group_edge[c, 1]
+            if row[a] != row[b]:
+                fits &= _cross(
+                    over[a], line[a], over[b], line[b], group_edge[c, 2], lines, left, right, before, many, where, steps
+                )
+        for c in range(settled, edges):
+            a, b = group_edge[c, 0], group_edge[c, 1]
+            change = (
+                group_edge[c, 2]
+                + group_edge[c, 5] * facing[group_edge[c, 3]]
+                + group_edge[c, 6] * facing[group_edge[c, 4]]
+            )
+            if (change != 0) & (row[a] != row[b]):
+                fits &= _cross(
+                    over[a], line[a], over[b], line[b], change, lines, left, right, before, many, where, steps
+                )
+        meets = False
+        for p in loose:
+            if piece_polygon[p] == own or height[p, 0] >= h:
+                continue
+            count = _loose_ring(p, starts, vertex, place, (1.0 - NEAR) * h, cut, cut2)
+            fits = fits and count >= 0
+            off = plane[p, 0] * px + plane[p, 1] * py + plane[p, 2] * h - plane[p, 3]
+            change = -1 if off > 0.0 else 1
+            for k in range(count):
+                r = h / (h - cut[k, 2])
+                cut2[k, 0] = px + (cut[k, 0] - px) * r
+                cut2[k, 1] = (py + (cut[k, 1] - py) * r - y0) / dy
+            for k in range(count):
+                j = k + 1 if k + 1 < count else 0
+                ax, at, bx, bt = cut2[k, 0], cut2[k, 1], cut2[j, 0], cut2[j, 1]
+                meets = meets or _reaches(lit, corners_lit, lit_box, y0, dy, ax, at, bx, bt)
+                fits = fits and _cross(ax, at, bx, bt, change, lines, left, right, before, many, where, steps)
+        tally[EDGES] += edges
+        if not fits:
+            return STATE_COMPLEX, 0.0, 0.0
+        uncut = True
+        for k in range(lines):
+            uncut = uncut and many[k] == 0
+        meets = meets or not uncut
+        if not meets:
+            # Does a silhouette lie between the lines?
+            for c in range(edges):
+                a, b = group_edge[c, 0], group_edge[c, 1]
+                change = (
+                    group_edge[c, 2]
+                    + group_edge[c, 5] * facing[group_edge[c, 3]]
+                    + group_edge[c, 6] * facing[group_edge[c, 4]]
+                )
+                if change != 0 and _reaches(lit, corners_lit, lit_box, y0, dy, over[a], line[a], over[b], line[b]):
+                    meets = True
+                    break
+            if not meets:
+                hiding = 0
+                for k in range(lines):
+                    hiding += before[k] > 0
+                if hiding == 0:
+                    return STATE_CLEAR, 0.0, 0.0
+                if hiding == lines:
+                    return STATE_DARK, 1.0, 0.0
+        dark, error = _sum_lines(lines, y0, dy, px, py, h, nx, ny, nz, left, right, before, many, where, steps, hidden)
+        tally[LINES] += lines
+        if lines == most or (error <= SURE * allowed and not uncut) or not meets:
+            return STATE_SAMPLED, dark, error
+        more = 4.0 if uncut else min(max((error / allowed) ** (2.0 / 3.0), 1.5), 4.0)
+        lines = min(math.ceil(more * lines), most)
+
+
+@njit(nogil=True, cache=True)
 def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, allowed, rays, seed, limit, out, tally):
     """Visible shares of the points of ``chosen`` tiles whose state is COMPLEX, by lines.
 
     ``fewest`` lines are drawn, and more (up to ``most``) where the share's error is then above
     ``allowed``.  Where no silhouette lies before the sender a point is settled for certain, CLEAR or
-    DARK; others become SAMPLED.  Left COMPLEX are points with panes before the sender, with a line of
-    too many crossings, or with so many pieces or edges to look at that ``rays`` rays a point would be
-    cheaper.
+    DARK; others become SAMPLED.  On a flat tile the share is smooth as far as the light blurs the
+    nearest edge: there lines are drawn at some points, and where the share fitted to them foretells each
+    of them it is taken for the others.  Left COMPLEX are points with panes before the sender, with a
+    line of too many crossings, or with so many pieces or edges to look at that ``rays`` rays a point
+    would be cheaper.
     """
-    points, normals, index, own, tile_start, tile_bounds, tile_normal, tile_offset, tile_own = tiles
-    corners, sender_low, sender_high, sender_normal, sender_own = sender
-    starts, piece_polygon, through, vertex, _, ends, _, _ = table
+    points, normals, index, own, flat, tile_start, tile_bounds, tile_normal, tile_offset, tile_own = tiles
+    corners, sender_low, sender_high, sender_normal, sender_own, sender_width = sender
+    _, piece_polygon, through, _, _, ends, _, _ = table
     origin, axes, ring, place, plane, height = frame
     low, high, skip, head, leaf, order, bounds = tree
     part, share, doubt, state, candidates = out
@@ -577,7 +741,7 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
     owned = np.zeros(polygons, dtype=np.int64)
     tile_marks = (
         np.zeros(pieces, np.int64), np.zeros(pieces, np.int64), np.zeros(ends.shape[0], np.int64),
-        np.zeros(place.shape[0], np.int64), np.empty((place.shape[0], 3)),
+        np.zeros(place.shape[0], np.int64), np.empty((place.shape[0], 4)),
     )  # fmt: skip
     group_marks = (
         np.zeros(pieces, np.int64), np.zeros(pieces, np.int64), np.zeros(pieces, np.int64),
@@ -589,28 +753,36 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
     tile_room = min(ends.shape[0], 8 * room)
     tile_out = np.empty(tile_room, np.int64), np.empty(tile_room, np.int64), np.empty((tile_room, 2), np.int64)
     group_out = np.empty(tile_room, np.int64), np.empty(tile_room, np.int64), np.empty((tile_room + 1, 2), np.int64)
-    part_out = np.empty(tile_room, np.int64), np.empty(tile_room, np.int64), np.empty((tile_room + 1, 2), np.int64)
     group_room = min(room, ends.shape[0])
-    group_edge, group_vertex = np.empty((group_room, 7), np.int64), np.empty((3, 2 * group_room))
-    group_piece, group_plane = np.empty(2 * group_room, np.int64), np.empty((4, 2 * group_room))
-    facing = np.zeros(2 * group_room + 1, np.int64)
-    gathered = (group_edge, group_vertex, group_piece, group_plane)
-    over, line, row = np.empty(2 * group_room), np.empty(2 * group_room), np.empty(2 * group_room)
+    group = (
+        np.empty((group_room, 7), np.int64), np.empty((3, 2 * group_room)),
+        np.empty(2 * group_room, np.int64), np.empty((4, 2 * group_room)),
+    )  # fmt: skip
     planes = np.empty((MAX_SHAFT_PLANES, 4))
     found, loose = np.empty(many_pieces, np.int64), np.empty(many_pieces, np.int64)
-    box, ring_box, lit_box = np.empty((2, 3)), np.empty((2, 2)), np.empty((2, 2))
-    lit = np.empty((ring.shape[0] + 1, 2))
-    cut, cut2 = np.empty((64, 3)), np.empty((66, 3))
-    left, right = np.empty(most), np.empty(most)
-    before, many = np.empty(most, np.int64), np.empty(most, np.int64)
-    where, steps = np.empty((most, CROSSINGS)), np.empty((most, CROSSINGS), np.int64)
-    hidden = np.empty((2, most))
+    box, ring_box = np.empty((2, 3)), np.empty((2, 2))
+    scratch = (
+        np.empty((ring.shape[0] + 1, 2)), np.empty((2, 2)), np.empty((64, 3)), np.empty((66, 3)), np.empty(most),
+        np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64), np.empty((most, CROSSINGS)),
+        np.empty((most, CROSSINGS), np.int64), np.empty((2, most)), np.empty(2 * group_room),
+        np.empty(2 * group_room), np.empty(2 * group_room), np.zeros(2 * group_room + 1, np.int64),
+    )  # fmt: skip
     for axis in range(2):
         ring_box[0, axis], ring_box[1, axis] = ring[:, axis].min(), ring[:, axis].max()
     longest = 0
     for t in chosen:
         longest = max(longest, tile_start[t + 1] - tile_start[t])
     places = np.empty((longest, 3))
+    # Rows of the points asked for, region after region, and the regions yet to be looked at.
+    rows, spare = np.empty(longest, np.int64), np.empty(longest, np.int64)
+    stack = np.empty((longest + 8, 2), np.int64)
+    region = np.empty((2, 2))
+    nodes = (
+        np.empty(NODES, np.int64), np.empty(NODES), np.empty((NODES, TERMS)), np.empty((TERMS, TERMS)), np.empty(TERMS),
+        np.empty(NODES), np.empty(TERMS),
+    )  # fmt: skip
+    node_row, node_value = nodes[0], nodes[5]
+    node_lines = min(math.ceil(fewest * NODE_NOISE ** (-2.0 / 3.0)), most)
 
     for t in chosen:
         first, last = tile_start[t], tile_start[t + 1]
@@ -623,12 +795,14 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
             if own[i] >= 0 and own[i] != tile_own[t]:
                 owned[own[i]] = tile_mark
         _bounds(places, 0, last - first, box)
-        asked_points = 0
+        asked = 0
         for i in range(first, last):
-            asked_points += state[i] == STATE_COMPLEX
-        if box[0, 2] <= 0.0 or asked_points == 0:
+            if state[i] == STATE_COMPLEX:
+                rows[asked] = i
+                asked += 1
+        if box[0, 2] <= 0.0 or asked == 0:
             continue
-        budget = min(many_pieces, max(EDGES_A_RAY * rays * asked_points, 64))
+        budget = min(many_pieces, max(EDGES_A_RAY * rays * asked, 64))
         used = tile_shaft(
             tile_bounds[t], tile_normal[t], tile_offset[t], sender_low, sender_high, sender_normal, corners, slack,
             planes,
@@ -663,149 +837,83 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
         tile_edges = _tile_edges(found[:kept], box, ring_box, table, frame, mark, tile_marks, tile_out)
         if tile_edges > tile_room:
             continue
-        start = stop = first
-        narrowed = 0
-        while stop < last:
-            # Groups of neighbours; where they still see many edges, smaller ones inside them.
-            start = stop
-            if (start - first) % GROUP == 0:
-                mark += 1
-                _bounds(places, start - first, min(start + GROUP, last) - first, box)
-                narrowed = _narrow(
-                    tile_edges, tile_out, box, ring_box, table, frame, mark, tile_mark, owned, group_marks, group_out
-                )
-            stop = min(start + (GROUP if narrowed <= CROWDED else PART), last)
-            asked_points = 0
-            for i in range(start, stop):
-                asked_points += state[i] == STATE_COMPLEX
-            if asked_points == 0:
+        various = tile_own[t] == DIFFERENT
+        smooth = (
+            apart == 0
+            and not various
+            and (tile_normal[t, 0] != 0.0 or tile_normal[t, 1] != 0.0 or tile_normal[t, 2] != 0.0)
+        )
+        stack[0, 0], stack[0, 1] = 0, asked
+        top = 0
+        while top >= 0:
+            a, b = stack[top, 0], stack[top, 1]
+            top -= 1
+            if not smooth and b - a > GROUP:
+                top = cut_runs(a, b, GROUP, stack, top)
                 continue
-            edges = narrowed
             mark += 1
-            if narrowed <= CROWDED:
-                if edges > group_room:
+            _bounds_of(places, rows, a, b, first, box)
+            edges, highest = _narrow(
+                tile_edges, tile_out, box, ring_box, table, frame, mark, tile_mark, owned, group_marks, group_out
+            )
+            # Where no edge can pass before the sender all points see alike: one tells.
+            alike = smooth and highest == -np.inf
+            fitted = smooth and not alike and b - a > FEW
+            if fitted:
+                count = 0
+                if edges <= group_room and _blurred(box, highest, ring_box, sender_width):
+                    count = pick_nodes(flat, rows, a, b, region, nodes)
+                if count == 0:
+                    top = quarter(flat, rows, a, b, spare, stack, top)
                     continue
-                settled, spots, unsure = _gather_edges(edges, group_out, table, frame, mark, group_marks, gathered)
+            elif edges > min(CROWDED, group_room) and b - a > PART and not alike:
+                top = quarter(flat, rows, a, b, spare, stack, top) if smooth else cut_runs(a, b, PART, stack, top)
+                continue
+            elif edges > group_room:
+                continue
             else:
-                _bounds(places, start - first, stop - first, box)
-                edges = _narrow(
-                    narrowed, group_out, box, ring_box, table, frame, mark, tile_mark, owned, group_marks, part_out
-                )
-                if edges > group_room:
+                count = 1 if alike else b - a
+            mark += 1
+            settled, spots, unsure = _gather_edges(edges, group_out, table, frame, mark, group_marks, group)
+            sizes = edges, settled, spots, unsure
+            lit = dark = 0
+            for k in range(count):
+                i = node_row[k] if fitted else rows[a + k]
+                if state[i] == STATE_COMPLEX:
+                    nx, ny, nz = _turned(axes, normals[i, 0], normals[i, 1], normals[i, 2])
+                    seen, hidden, error = _look(
+                        places[i - first, 0], places[i - first, 1], places[i - first, 2], nx, ny, nz, own[i],
+                        shift(index[i], seed)[0], node_lines if fitted else fewest, most,
+                        NODE_NOISE * allowed if fitted else allowed, ring, group, sizes, frame, table, loose[:apart],
+                        various, scratch, tally,
+                    )  # fmt: skip
+                    if seen != STATE_COMPLEX:
+                        state[i], share[i], doubt[i] = seen, (1.0 - hidden) * part[i], error * part[i]
+                        candidates[i] = 0 if seen == STATE_CLEAR else limit + 1
+                        tally[COMPLEX if seen == STATE_SAMPLED else CLEAR if seen == STATE_CLEAR else DARK] += 1
+                lit += state[i] == STATE_CLEAR
+                dark += state[i] == STATE_DARK
+                if fitted:
+                    node_value[k] = share[i] / part[i] if state[i] != STATE_COMPLEX else np.nan
+            if alike and lit + dark == 1:
+                i = rows[a]
+                for k in range(a + 1, b):
+                    j = rows[k]
+                    if state[j] == STATE_COMPLEX:
+                        state[j], candidates[j] = state[i], candidates[i]
+                        share[j], doubt[j] = part[j] if lit else 0.0, 0.0
+                        tally[CLEAR if lit else DARK] += 1
+            elif fitted:
+                # What all nodes agree on is made sure of at every point.
+                off = np.inf if lit == count or dark == count else fit_cubic(flat, region, count, nodes)
+                if not off <= FIT_MARGIN * allowed:
+                    top = quarter(flat, rows, a, b, spare, stack, top)
                     continue
-                mark += 1
-                settled, spots, unsure = _gather_edges(edges, part_out, table, frame, mark, group_marks, gathered)
-            for i in range(start, stop):
-                if state[i] != STATE_COMPLEX:
-                    continue
-                px, py, h = places[i - first, 0], places[i - first, 1], places[i - first, 2]
-                nx, ny, nz = _turned(axes, normals[i, 0], normals[i, 1], normals[i, 2])
-                corners_lit = _clip_ring(ring, nx, ny, nx * px + ny * py + nz * h, lit)
-                if corners_lit < 3:
-                    continue
-                _bounds(lit, 0, corners_lit, lit_box)
-                if not lit_box[1, 1] > lit_box[0, 1]:
-                    continue
-                offset = shift(index[i], seed)[0]
-                _face(group_plane, unsure, px, py, h, facing)
-                if tile_own[t] == DIFFERENT:
-                    for c in range(unsure):
-                        if piece_polygon[group_piece[c]] == own[i]:
-                            facing[c] = 0
-                lines, dark, error = fewest, 0.0, np.inf
-                meets = fits = True
-                while True:
-                    dy = (lit_box[1, 1] - lit_box[0, 1]) / lines
-                    y0 = lit_box[0, 1] + offset * dy
-                    _lay_lines(lit, corners_lit, lines, y0, dy, left, right)
-                    for k in range(lines):
-                        before[k] = many[k] = 0
-                    _project(group_vertex, spots, px, py, h, y0, dy, lines, over, line, row)
-                    for c in range(settled):
-                        a, b = group_edge[c, 0], group_edge[c, 1]
-                        if row[a] != row[b]:
-                            fits &= _cross(
-                                over[a], line[a], over[b], line[b], group_edge[c, 2], lines, left, right, before,
-                                many, where, steps,
-                            )  # fmt: skip
-                    for c in range(settled, edges):
-                        a, b = group_edge[c, 0], group_edge[c, 1]
-                        change = (
-                            group_edge[c, 2]
-                            + group_edge[c, 5] * facing[group_edge[c, 3]]
-                            + group_edge[c, 6] * facing[group_edge[c, 4]]
-                        )
-                        if (change != 0) & (row[a] != row[b]):
-                            fits &= _cross(
-                                over[a], line[a], over[b], line[b], change, lines, left, right, before, many, where,
-                                steps,
-                            )  # fmt: skip
-                    meets = False
-                    for c in range(apart):
-                        p = loose[c]
-                        if piece_polygon[p] == own[i] or height[p, 0] >= h:
-                            continue
-                        count = _loose_ring(p, starts, vertex, place, (1.0 - NEAR) * h, cut, cut2)
-                        fits = fits and count >= 0
-                        off = plane[p, 0] * px + plane[p, 1] * py + plane[p, 2] * h - plane[p, 3]
-                        change = -1 if off > 0.0 else 1
-                        for k in range(count):
-                            r = h / (h - cut[k, 2])
-                            cut2[k, 0] = px + (cut[k, 0] - px) * r
-                            cut2[k, 1] = (py + (cut[k, 1] - py) * r - y0) / dy
-                        for k in range(count):
-                            j = k + 1 if k + 1 < count else 0
-                            ax, at, bx, bt = cut2[k, 0], cut2[k, 1], cut2[j, 0], cut2[j, 1]
-                            meets = meets or _reaches(lit, corners_lit, lit_box, y0, dy, ax, at, bx, bt)
-                            fits = fits and _cross(
-                                ax, at, bx, bt, change, lines, left, right, before, many, where, steps
-                            )
-                    tally[EDGES] += edges
-                    if not fits:
-                        break
-                    uncut = True
-                    for k in range(lines):
-                        uncut = uncut and many[k] == 0
-                    meets = meets or not uncut
-                    if not meets:
-                        # Does a silhouette lie between the lines?
-                        for c in range(edges):
-                            a, b = group_edge[c, 0], group_edge[c, 1]
-                            change = (
-                                group_edge[c, 2]
-                                + group_edge[c, 5] * facing[group_edge[c, 3]]
-                                + group_edge[c, 6] * facing[group_edge[c, 4]]
-                            )
-                            if change != 0 and _reaches(
-                                lit, corners_lit, lit_box, y0, dy, over[a], line[a], over[b], line[b]
-                            ):
-                                meets = True
-                                break
-                        if not meets:
-                            break
-                    dark, error = _sum_lines(
-                        lines, y0, dy, px, py, h, nx, ny, nz, left, right, before, many, where, steps, hidden
-                    )
-                    tally[LINES] += lines
-                    if lines == most or (error <= SURE * allowed and not uncut):
-                        break
-                    more = 4.0 if uncut else min(max((error / allowed) ** (2.0 / 3.0), 1.5), 4.0)
-                    lines = min(math.ceil(more * lines), most)
-                if not fits:
-                    continue
-                if not meets:
-                    hiding = 0
-                    for k in range(lines):
-                        hiding += before[k] > 0
-                    if hiding == 0:
-                        share[i], state[i], candidates[i] = part[i], STATE_CLEAR, 0
-                        tally[CLEAR] += 1
-                        continue
-                    if hiding == lines:
-                        share[i], state[i], candidates[i] = 0.0, STATE_DARK, limit + 1
-                        tally[DARK] += 1
-                        continue
-                candidates[i] = limit + 1
-                tally[COMPLEX] += 1
-                share[i], doubt[i] = (1.0 - dark) * part[i], error * part[i]
-                state[i] = STATE_SAMPLED
+                for k in range(a, b):
+                    i = rows[k]
+                    if state[i] == STATE_COMPLEX:
+                        state[i], candidates[i] = STATE_SAMPLED, limit + 1
+                        share[i] = min(max(cubic_at(flat, i, region, nodes), 0.0), 1.0) * part[i]
+                        doubt[i] = off * part[i]
+                        tally[COMPLEX] += 1
+                        tally[FITTED] += 1
