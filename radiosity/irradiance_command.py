@@ -5,6 +5,7 @@ Only ``click`` is imported at the top; everything heavy is imported when the com
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,8 +26,9 @@ __all__ = ["irradiance"]
 
 CHUNK = 65_536
 """Points gathered at once: memory stays bounded however many there are."""
-SHARE = 0.7
-"""Share of the wanted error for the solve, and for sampling: the two are independent."""
+SOLVE_SHARE = 0.8
+"""Share of the wanted error for the solve; sampling may take what its estimate leaves of the square, and at least:"""
+LEAST_SHARE = 0.6
 UNSHOT_SHARE = 0.2
 """Share of it for light that a solve of given elements has not shot."""
 
@@ -148,7 +150,7 @@ def _solution(
     else:
         with record.stage("solve"):
             if elements is None:
-                solution = radiosity.solve(scene, error=SHARE * error, workers=workers, seed=seed)
+                solution = radiosity.solve(scene, error=SOLVE_SHARE * error, workers=workers, seed=seed)
             else:
                 tolerance = min(0.01, UNSHOT_SHARE * error)
                 solution = radiosity.solve(scene, elements=elements, tolerance=tolerance, workers=workers, seed=seed)
@@ -174,12 +176,17 @@ def _gather(
     with record.stage("prepare"):
         gatherer = Gatherer(solution, workers=workers, seed=seed)
     parts = []
+    # The two errors are independent.  Of a given solution nothing may be known: half of the square for each then.
+    estimate = solution.record.errors.get("estimate", {}).get("total", math.sqrt(0.5) * error)
+    share = math.sqrt(max(error**2 - estimate**2, (LEAST_SHARE * error) ** 2))
+    record.settings["sampling_error"] = share
     with record.stage("gather"), tqdm(total=len(rows), unit="points", disable=None, leave=False) as bar:
         for first in range(0, len(rows), CHUNK):
             some = rows[first : first + CHUNK]
-            parts.append(gatherer.irradiance(some[:, :3], some[:, 3:], error=SHARE * error))
+            parts.append(gatherer.irradiance(some[:, :3], some[:, 3:], error=share))
             record.counters.merge(parts[-1].counters)
             bar.update(len(some))
+    record.results["sampling_error_reached"] = all(part.reached for part in parts)
     record.choices["gather"] = ", ".join(sorted({part.method for part in parts}))
     return parts
 
@@ -240,6 +247,9 @@ def _summary(
     estimate = record.errors["solution"].get("estimate")
     if estimate is not None:
         lines.insert(1, f"error of the solution: {estimate['total']:.2g} of the mean irradiance over all surfaces")
+    if not record.results["sampling_error_reached"]:
+        asked = record.settings["sampling_error"]
+        lines.append(f"sampling did not come down to {asked:.2g}: that takes more rays a point than can be had")
     if dark:
         lines.append(f"{dark} points receive nothing: behind or inside a surface, or turned away from all light")
     if out_path != "-":

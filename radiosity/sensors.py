@@ -24,7 +24,6 @@ from radiosity._gather_kernels import RUNS, collect_hits, gather_rays, net_bits
 from radiosity.element_lookup import ElementLookup, bounding_rectangle, element_gradients
 from radiosity.patches import PatchMesh
 from radiosity.solvers.solution import Solution
-from workbench.accel.embree import BLOCK_RAYS
 from workbench.arrays import as_points, as_unit_vectors
 from workbench.counters import Counters
 from workbench.culling.tally import BOX, CHECK, CLOSED, CUT, PIECES, add_tally, new_tally
@@ -41,10 +40,15 @@ IntArray = NDArray[np.int64]
 
 MOST_LIGHTS = 64
 """Emitting polygons of one surface that are each asked as a light; those of a larger mesh are gathered."""
-PILOT_RAYS = 64
-"""Rays a point by which the number of rays is chosen."""
+PILOT_RAYS = (16, 64)
+"""Rays a point by which the number of rays is chosen: as many as 0.03 of error needs, within these."""
+PILOT_ERROR = 0.03
 MOST_RAYS = 65536
 """Most rays a point."""
+MOST_ROUNDS = 8
+"""Rounds in which rays are added where the spread says that they are too few."""
+BLOCK_RAYS = 16384
+"""Rays made, traced and read at once: few enough that all threads have some of them."""
 MOST_PANES = 8
 """Panes in a row that a ray goes through."""
 NET_GAIN = 0.7
@@ -55,11 +59,12 @@ DIRECT_SHARE = 0.5
 """Share of the wanted error that sampled direct light may take."""
 COARSE = 0.5
 """Distance, in diameters of an element, below which rays that hit it may need more than the mesh knows."""
-DEEP_HITS = 8
-"""Such hits of a run of rays whose light is gathered again, instead of read from the mesh."""
+DEEP_HITS, DEEP_FOR, MOST_DEEP = 4, 600, 256
+"""Such hits of a run whose light is gathered again, instead of read from the mesh, in bundles of 600 rays; their number
+grows with the power 3/2 of the rays, as the variance falls.  And the most of them."""
 NEAR_RAYS = 512
 """Rays a point that find them where the rest is gathered in closed form."""
-DEEP_RAYS = 16
+DEEP_RAYS = 8
 """Rays from each of them, and the error of its direct light:"""
 DEEP_ERROR = 0.05
 
@@ -74,8 +79,8 @@ MOST_PIECES = 20_000
 """Most pieces of elements that are gathered in closed form."""
 CELL_SHARE = 0.01
 """Share of the wanted error that one cell of an element may take where its radiosity has a slope."""
-TRIAL = 32
-"""One point in so many is gathered in closed form to see what that costs."""
+TRIAL, MOST_TRIALS = 32, 8
+"""One point in so many is gathered in closed form to see what that costs, but not more of them than that."""
 CUT_LIMIT = 40
 """Longest list of candidates that is cut at once; longer ones cut the element into parts."""
 
@@ -94,6 +99,8 @@ class IrradianceEstimate:
     distance : (n,) float
         Harmonic mean distance of what the indirect light comes from, infinite where nothing is
         seen: the scale on which it changes. [scene lengths]
+    reached : bool
+        Whether sampling is within the wanted error; if not, :data:`MOST_RAYS` a point were not enough.
     method : str
         How indirect light was gathered: ``"rays"``, ``"exact"`` (every element in closed form, cut by
         what hides it) or ``"none"`` (nothing is reflected).
@@ -107,6 +114,7 @@ class IrradianceEstimate:
     indirect: FloatArray
     standard_error: FloatArray
     distance: FloatArray
+    reached: bool
     method: str
     counters: Counters
     seconds: dict[str, float]
@@ -259,16 +267,16 @@ class Gatherer:
         begin = time.perf_counter()
         who = np.full(len(place), -1, dtype=np.int64) if own_polygon is None else own_polygon
         straight = self.direct(place, facing, own_polygon=who, error=error, counters=counters)
-        direct, direct_error, crowded = straight.irradiance, straight.standard_error, straight.crowded
         seconds["direct"] = time.perf_counter() - begin
         begin = time.perf_counter()
-        indirect, doubt, distance, method, from_sky = self._indirect(
-            place, facing, own_polygon, direct, crowded, error, rays, counters
-        )
-        direct = direct + from_sky
+        found, method = self._indirect(place, facing, own_polygon, straight, error, rays, counters)
+        direct = straight.irradiance + found.sky
+        whole, doubt = direct + found.indirect, np.hypot(straight.standard_error, found.standard_error)
         seconds["indirect"] = time.perf_counter() - begin
+        square = (doubt**2).mean(axis=0)
+        reached = bool((square <= (error * whole.mean(axis=0)) ** 2).all())
         return IrradianceEstimate(
-            direct + indirect, direct, indirect, np.hypot(direct_error, doubt), distance, method, counters, seconds
+            whole, direct, found.indirect, doubt, found.distance, reached, method, counters, seconds
         )
 
     def indirect(
@@ -308,14 +316,13 @@ class Gatherer:
         if not self.reflected.any() and self.sky is None:
             return Bundled(np.zeros(shape), np.zeros(shape), np.full(len(points), math.inf), np.zeros(shape))
         bundle = self._empty_bundle(points, normals, np.ones(len(points), dtype=bool))
-        self._extend(bundle, np.arange(len(points)), max(_power_of_two(rays), 2 * RUNS), counters)
+        self._extend(bundle, np.full(len(points), max(_power_of_two(rays), 2 * RUNS)), counters)
         mean, spread, sky = bundle.result()
         if error is not None and direct is not None:
             allowed = error * (direct + mean + sky)
             over = (spread / np.where(allowed > 0, allowed, math.inf)).max(axis=1)
             target = 2 ** np.ceil(np.log2(bundle.count * np.maximum(over, 1.0) ** (4.0 / 3.0)) - 0.5)
-            for total in np.unique(target[target > bundle.count]).tolist():
-                self._extend(bundle, np.flatnonzero(target == total), int(min(total, MOST_RAYS)), counters)
+            self._extend(bundle, np.minimum(target, MOST_RAYS).astype(np.int64), counters)
             mean, spread, sky = bundle.result()
         return Bundled(mean, spread, bundle.distance(), sky)
 
@@ -351,61 +358,71 @@ class Gatherer:
         points: FloatArray,
         normals: FloatArray,
         own: ArrayLike | None,
-        direct: FloatArray,
-        crowded: NDArray[np.bool_],
+        straight: Direct,
         error: float,
         rays: int | None,
         counters: Counters,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, str, FloatArray]:
-        """Indirect irradiance, its standard error, harmonic mean distance, the method chosen, and sky seen by rays."""
+    ) -> tuple[Bundled, str]:
+        """Indirect irradiance, and the sky where only rays see it; with the method chosen."""
+        direct, crowded = straight.irradiance, straight.crowded
         n, bands = direct.shape
         nothing = np.zeros((n, bands))
         if not self.reflected.any() and not crowded.any():
-            return nothing, nothing.copy(), np.full(n, math.inf), "none", nothing
+            return Bundled(nothing, nothing.copy(), np.full(n, math.inf), nothing), "none"
         bundle = self._empty_bundle(points, normals, crowded)
         if rays is not None:
-            self._extend(bundle, np.arange(n), max(_power_of_two(rays), 2 * RUNS), counters)
-            mean, spread, from_sky = bundle.result()
-            return mean, spread, bundle.distance(), "rays", from_sky
+            self._extend(bundle, np.full(n, max(_power_of_two(rays), 2 * RUNS)), counters)
+            return bundle.found(), "rays"
         who = np.full(n, -1, dtype=np.int64) if own is None else np.broadcast_to(np.asarray(own, np.int64), (n,))
         # Closed forms know no candidates yet: what they cost at least.
         least = math.inf
         lit: NDArray[np.bool_] = np.asarray(self.reflected.any(axis=1))
         if not crowded.any() and np.count_nonzero(lit[self.lookup.piece_element]) <= MOST_PIECES:
             least = GROUP_COST * self._exact.groups + COSTS[CLOSED] * self._exact.pieces
-        if least <= PILOT_RAYS:
-            self._extend(bundle, np.arange(n), 4 * RUNS, counters)
-            small = CELL_SHARE * error * (direct + bundle.result()[0]).mean(axis=0)
-            value, doubt, _ = self._closed_forms(points, normals, who, np.arange(n), small, counters)
-            fix, unsure = self._near_correction(bundle, counters)
-            return value + fix, doubt + unsure, bundle.distance(), "exact", nothing
-        self._extend(bundle, np.arange(n), PILOT_RAYS, counters)
-        mean, spread, from_sky = bundle.result()
-        level = (direct + mean + from_sky).mean(axis=0)
-        allowed = math.sqrt(1.0 - DIRECT_SHARE**2) * error * level
-        # Of the bands, the one that is furthest from its error decides.
-        over = (spread / np.where(allowed > 0, allowed, math.inf)).max(axis=1)
-        target = 2 ** np.ceil(np.log2(PILOT_RAYS * np.maximum(over, 1.0) ** (4.0 / 3.0)) - 1e-9)
-        if least * n < target.sum() - PILOT_RAYS * n:
-            trial = np.arange(0, n, TRIAL)
-            value, doubt, cost = self._closed_forms(points, normals, who, trial, CELL_SHARE * error * level, counters)
-            if cost / len(trial) * n < target.sum() - PILOT_RAYS * n:
-                rest = np.setdiff1d(np.arange(n), trial)
-                other = self._closed_forms(points, normals, who, rest, CELL_SHARE * error * level, counters)
-                fix, unsure = self._near_correction(bundle, counters)
-                return value + other[0] + fix, doubt + other[1] + unsure, bundle.distance(), "exact", nothing
-        for total in np.unique(target[target > PILOT_RAYS]).tolist():
-            self._extend(bundle, np.flatnonzero(target == total), int(min(total, MOST_RAYS)), counters)
-        mean, spread, from_sky = bundle.result()
-        return mean, spread, bundle.distance(), "rays", from_sky
+        pilot = _power_of_two(round(PILOT_RAYS[1] * (PILOT_ERROR / error) ** (4.0 / 3.0)))
+        pilot = min(max(pilot, PILOT_RAYS[0]), PILOT_RAYS[1])
+        closed = least <= pilot
+        self._extend(bundle, np.full(n, 4 * RUNS if closed else pilot), counters)
+        for step in range(MOST_ROUNDS):
+            mean, spread, from_sky = bundle.result()
+            level = (direct + mean + from_sky).mean(axis=0)
+            small = CELL_SHARE * error * level
+            # What direct light has left of the error; of few points the spread tells but roughly.
+            allowed = (error * level) ** 2
+            allowed -= np.minimum((straight.standard_error**2).mean(axis=0), DIRECT_SHARE**2 * allowed)
+            allowed /= 1.0 + math.sqrt(2.0 / ((RUNS - 1) * n))
+            if closed:
+                return self._closed(bundle, who, small, allowed, counters), "exact"
+            if ((spread**2).mean(axis=0) <= allowed).all():
+                break
+            target = _allotted(spread**2, bundle.count, allowed)
+            wanted = int((target - bundle.count).sum())
+            if wanted == 0:
+                break
+            if step == 0 and least * n < wanted:
+                trial = np.unique(np.linspace(0, n - 1, min(-(-n // TRIAL), MOST_TRIALS)).astype(np.int64))
+                cost = self._closed_forms(points, normals, who, trial, small, counters)[2]
+                if cost * n < wanted * len(trial):
+                    return self._closed(bundle, who, small, allowed, counters), "exact"
+            self._extend(bundle, target, counters)
+        return bundle.found(), "rays"
 
-    def _near_correction(self, bundle: _Bundle, counters: Counters) -> tuple[FloatArray, FloatArray]:
-        """What closed forms over the mesh are off by where elements are coarse for their distance, and its error."""
-        near = np.flatnonzero(bundle.close)
-        if len(near):
-            self._extend(bundle, near, NEAR_RAYS, counters)
-        mean, spread = bundle.runs_of(bundle.fix)
-        return mean, np.where(bundle.close[:, None] > 0, spread / NET_GAIN, 0.0)
+    def _closed(
+        self, bundle: _Bundle, own: IntArray, small: FloatArray, allowed: FloatArray, counters: Counters
+    ) -> Bundled:
+        """Everything in closed form, but for what rays find of elements that are coarse for their distance."""
+        every = np.arange(len(bundle.points))
+        value, doubt, _ = self._closed_forms(bundle.points, bundle.normals, own, every, small, counters)
+        near = bundle.close > 0
+        target = np.where(near, np.maximum(NEAR_RAYS, bundle.count), bundle.count)
+        for _ in range(MOST_ROUNDS):
+            self._extend(bundle, target, counters)
+            fix, unsure = bundle.runs_of(bundle.fix)
+            unsure = np.where(near[:, None], unsure / NET_GAIN, 0.0)
+            if ((unsure**2).mean(axis=0) <= allowed).all():
+                break
+            target = _allotted(unsure**2, bundle.count, allowed)
+        return Bundled(value + fix, doubt + unsure, bundle.distance(), np.zeros_like(value))
 
     def _empty_bundle(self, points: FloatArray, normals: FloatArray, crowded: NDArray[np.bool_]) -> _Bundle:
         n, bands = len(points), self.reflected.shape[1]
@@ -469,32 +486,39 @@ class Gatherer:
             cost += sum(each * int(tally[row]) for row, each in COSTS.items())
         return out, doubt, cost
 
-    def _extend(self, bundle: _Bundle, rows: IntArray, count: int, counters: Counters) -> None:
-        """Shoot the rays of some bundles up to ``count``, a power of two."""
-        before = int(bundle.count[rows[0]])
-        if before:
-            # The runs so far are the first rays of the longer net's first runs.
-            for sums in (bundle.sums, bundle.fix, bundle.seen):
-                longer = np.zeros((len(rows), *sums.shape[1:]))
-                for run in range(RUNS):
-                    longer[:, run * before // count] += sums[rows, run]
-                sums[rows] = longer
-        self._trace(bundle, rows, before, count, counters)
-        bundle.count[rows] = count
+    def _extend(self, bundle: _Bundle, target: IntArray, counters: Counters) -> None:
+        """Shoot rays until each bundle has ``target`` (n,) of them, powers of two; none where it has as many.
 
-    def _trace(self, bundle: _Bundle, rows: IntArray, first: int, count: int, counters: Counters) -> None:
-        """Shoot rays ``first..count`` of the bundles of some points, block by block over the threads."""
+        Block by block over the threads.
+        """
+        blocks: list[tuple[IntArray, int, int]] = []
+        more = np.flatnonzero(target > bundle.count)
+        for before, count in np.unique(np.column_stack([bundle.count, target])[more], axis=0).tolist():
+            rows = more[(bundle.count[more] == before) & (target[more] == count)]
+            if before:
+                # The runs so far are the first rays of the longer net's first runs.
+                for sums in (bundle.sums, bundle.fix, bundle.seen):
+                    longer = np.zeros((len(rows), *sums.shape[1:]))
+                    for run in range(RUNS):
+                        longer[:, run * before // count] += sums[rows, run]
+                    sums[rows] = longer
+            share = max(1, BLOCK_RAYS // (count - before))
+            blocks += [(rows[i : i + share], before, count) for i in range(0, len(rows), share)]
+        if blocks:
+            self._trace(bundle, blocks, counters)
+            bundle.count[more] = target[more]
+
+    def _trace(self, bundle: _Bundle, blocks: list[tuple[IntArray, int, int]], counters: Counters) -> None:
+        """Shoot rays of bundles: for each block its rows, the first ray and the number of rays of the whole net."""
         tracer, geometry, mesh = self.shader.tracer, self.geometry, self.solution.mesh
         centre, scale = tracer.frame
         law = bundle.sky.law if bundle.sky is not None else np.zeros(12)
-        bits = net_bits(count)
-        share = max(1, BLOCK_RAYS // (count - first))
-        blocks = [rows[i : i + share] for i in range(0, len(rows), share)]
-
-        deep = DEEP_HITS if bundle.deep else 0
+        bits = net_bits(max(count for *_, count in blocks))
         coarse = self._coarse if bundle.deep else np.zeros(mesh.element_count)
 
-        def work(block: IntArray) -> tuple[int, int, _Close]:
+        def work(task: tuple[IntArray, int, int]) -> tuple[int, int, _Close]:
+            block, first, count = task
+            deep = min(max(round(DEEP_HITS * (count / DEEP_FOR) ** 1.5), 1), MOST_DEEP) if bundle.deep else 0
             many = len(block) * (count - first)
             origins, directions = np.empty((many, 3), np.float32), np.empty((many, 3), np.float32)
             owner, run = np.empty(many, dtype=np.int32), np.empty(many, dtype=np.int32)
@@ -548,33 +572,57 @@ class Gatherer:
         send back, less what the mesh says, corrects the sum over all.
         """
         mesh = self.solution.mesh
-        rows = np.concatenate([block for block, *_ in found])
-        near, kept, element, side = (np.concatenate([part[i] for part in found]) for i in (1, 2, 3, 4))
-        bundle.close[rows] += near.sum(axis=1)
-        slots = np.minimum(near, DEEP_HITS)
-        point, run, slot = np.nonzero(np.arange(DEEP_HITS) < slots[..., None])
-        if not len(point):
+        parts = []
+        for rows, near, kept, element, side in found:
+            bundle.close[rows] += near.sum(axis=1)
+            slots = np.minimum(near, kept.shape[2])
+            point, run, slot = np.nonzero(np.arange(kept.shape[2]) < slots[..., None])
+            share = kept[point, run, slot, 3] * near[point, run] / slots[point, run]
+            parts.append((rows[point], run, kept[point, run, slot, :3], share, element[point, run, slot],
+                          side[point, run, slot]))  # fmt: skip
+        rows, run, place, share, e, polygon = (np.concatenate(part) for part in zip(*parts, strict=True))
+        if not len(rows):
             return
-        place, weight = kept[point, run, slot, :3], kept[point, run, slot, 3]
-        e, polygon = element[point, run, slot], side[point, run, slot]
         behind = polygon < 0
         polygon = np.where(behind, ~polygon, polygon)
         normal = self.geometry.polygon_normal[polygon] * np.where(behind, -1.0, 1.0)[:, None]
         lit = self.direct(place, normal, own_polygon=polygon, error=DEEP_ERROR, counters=counters)
         small = self._empty_bundle(place, normal, lit.crowded)
         small.deep = False
-        self._extend(small, np.arange(len(place)), DEEP_RAYS, counters)
+        self._extend(small, np.full(len(place), DEEP_RAYS), counters)
         indirect, _, from_sky = small.result()
         # What the mesh holds beside reflected light stays: the emission of lamps with too many facets.
         own = self.reflected[e] - mesh.reflectance[e] * self.solution.element_irradiance[e]
         true = mesh.reflectance[e] * (lit.irradiance + indirect + from_sky) + own
         read = np.einsum("nbk,nk->nb", self._linear[e, :, :3], place) + self._linear[e, :, 3]
-        share = weight * near[point, run] / slots[point, run]
-        np.add.at(bundle.fix, (rows[point], run), share[:, None] * (true - np.maximum(read, 0.0)))
+        np.add.at(bundle.fix, (rows, run), share[:, None] * (true - np.maximum(read, 0.0)))
 
 
 def _power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
+
+
+def _allotted(variance: FloatArray, count: IntArray, allowed: FloatArray) -> IntArray:
+    """Numbers of rays (n,), powers of two, with which the mean variance of all points is within ``allowed`` (bands,).
+
+    ``variance`` (n, bands) is that with ``count`` (n,) rays; it falls with their power -3/2.  The rays in all are
+    fewest (Lagrange) where each point has as many as the power 2/5 of its variance at one ray.
+    """
+    unit = variance * (count**1.5)[:, None]
+    # Of the bands, the one that is furthest from its error decides.
+    worst = (unit / np.where(allowed > 0, allowed, math.inf)).max(axis=1)
+
+    def rays(scale: float) -> FloatArray:
+        with np.errstate(divide="ignore"):
+            wanted = 2.0 ** np.round(np.log2(scale * worst**0.4))
+        return np.minimum(np.maximum(wanted, count), MOST_RAYS)
+
+    low, high = -20.0, 40.0  # powers of two
+    while high - low > 0.05:
+        middle = 0.5 * (low + high)
+        enough = (unit / (rays(2.0**middle) ** 1.5)[:, None]).mean(axis=0) <= np.maximum(allowed, 0.0)
+        low, high = (low, middle) if (enough | (allowed <= 0)).all() else (middle, high)
+    return np.maximum(rays(2.0**high), count).astype(np.int64)
 
 
 @dataclass
@@ -608,6 +656,11 @@ class _Bundle:
         fix, unsure = self.runs_of(self.fix)
         # What corrects a sum is drawn at random: it has no net's gain.
         return mean + fix, np.hypot(spread, unsure / NET_GAIN), from_sky
+
+    def found(self) -> Bundled:
+        """All that the rays found."""
+        mean, spread, from_sky = self.result()
+        return Bundled(mean, spread, self.distance(), from_sky)
 
     def runs_of(self, sums: FloatArray, beside: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Mean of sums (n, runs, bands) over the rays, and its standard error with ``beside``, means of the runs."""

@@ -6,11 +6,13 @@ import itertools
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from radiosity_scenes import cube_with_emitter
 
 import radiosity
 import workbench
-from radiosity.sensors import Gatherer
+from radiosity.sensors import MOST_RAYS, Gatherer, _allotted
 from workbench.errors import InputError, OptionError
 from workbench.scene.library import box_surface, diffuse, unit_cube
 from workbench.scene.model import Scene, Surface
@@ -77,6 +79,44 @@ def test_asked_error_is_kept_and_rays_grow_with_it(cornell):
         before = found.counters["rays"]
 
 
+def test_one_point_gets_rays_until_its_error_is_met(cornell):
+    solution, points, normals, own = cornell
+    truth = Gatherer(solution, workers=1).irradiance(points[:24], normals[:24], own_polygon=own[:24], rays=16384)
+    off = []
+    for i in range(24):
+        gatherer = Gatherer(solution, workers=1, seed=5 + i)
+        found = gatherer.irradiance(points[i : i + 1], normals[i : i + 1], own_polygon=own[i : i + 1], error=0.005)
+        assert found.reached
+        assert (found.standard_error <= 0.005 * found.irradiance).all()
+        off.append((found.irradiance - truth.irradiance[i]) / truth.irradiance[i])
+    # Each point alone: so are the errors of all together, whose truth has an error of its own.
+    assert np.sqrt(np.mean(np.square(off))) < 1.3 * 0.005
+
+
+def test_too_few_rays_are_said(cornell, monkeypatch):
+    solution, points, normals, own = cornell
+    monkeypatch.setattr("radiosity.sensors.MOST_RAYS", 64)
+    found = Gatherer(solution, workers=1).irradiance(points, normals, own_polygon=own, error=1e-3)
+    assert not found.reached
+    assert found.standard_error.max() > 1e-3 * found.irradiance.mean()
+
+
+@given(
+    st.lists(st.just(0.0) | st.floats(0.1, 1e3), min_size=1, max_size=30),
+    st.lists(st.sampled_from([16, 64, 1024]), min_size=30, max_size=30),
+    st.floats(1e-4, 10.0),
+)
+def test_rays_are_allotted_as_the_error_allows(spread, counts, allowed):
+    variance, count = np.square(spread)[:, None], np.array(counts[: len(spread)])
+    rays = _allotted(variance, count, np.array([allowed]))
+    assert ((rays >= count) & (rays & (rays - 1) == 0)).all()
+    foretold = (variance[:, 0] * (count / rays) ** 1.5).mean()
+    assert foretold <= allowed * (1 + 1e-9) or (rays[np.array(spread) > 0] == MOST_RAYS).all()
+    if rays.sum() > count.sum():  # no more than needed: half of them all would be too few
+        half = np.maximum(rays // 2, count)
+        assert (variance[:, 0] * (count / half) ** 1.5).mean() > 0.9 * allowed
+
+
 def test_answer_does_not_depend_on_workers(cornell):
     solution, points, normals, own = cornell
     one = Gatherer(solution, workers=1).irradiance(points, normals, own_polygon=own, rays=512)
@@ -107,18 +147,25 @@ def test_panes_dim_what_lies_behind_them():
         )
         return Scene("pane", surfaces, bands=1)
 
-    solution = radiosity.solve(room(0.3), elements=3, workers=1)
+    solution = radiosity.solve(room(0.3), elements=100, workers=1)
     points, normals = np.array([[0.5, 0.5, 0.9], [0.5, 0.5, 0.01]]), np.array([[0, 0, -1.0], [0, 0, 1.0]])
     found = solution.irradiance(points, normals, workers=1, rays=4096)
     from radiosity.form_factors.analytic import point_to_polygon
 
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    floor = solution.radiosity[solution.mesh.element_surface == 1][0, 0]
+    mesh = solution.mesh
+    floor = np.flatnonzero(mesh.element_surface == 1)
+    sent = sum(
+        solution.radiosity[e, 0] * point_to_polygon(points[:1], normals[:1], mesh.corners[4 * e : 4 * e + 4])[0]
+        for e in floor.tolist()
+    )
+    assert (np.diff(mesh.piece_start) == 4).all()
+    assert len(floor) > 20
     seen_whole = point_to_polygon(points[:1], normals[:1], square)[0]
     seen_by_pane = point_to_polygon(points[:1], normals[:1], square + [0, 0, 0.5])[0]
     # Every line from the point to the floor goes through the pane, for the pane covers the floor.
     assert seen_by_pane > seen_whole
-    assert found.indirect[0, 0] == pytest.approx(0.3 * floor * seen_whole, rel=0.01)
+    assert found.indirect[0, 0] == pytest.approx(0.3 * sent, rel=0.01)
     assert found.direct[1, 0] == pytest.approx(0.3 * point_to_polygon(points[1:], normals[1:], square + [0, 0, 1])[0])
 
 
