@@ -30,6 +30,7 @@ from workbench.culling.plane_vertex import outside_planes
 from workbench.culling.shaft import box_shaft
 from workbench.culling.tally import CLEAR as TALLY_CLEAR
 from workbench.culling.tally import CLOSED, COMPLEX, DARK, EMPTY, HORIZON, LINK, SHAFT, SHAFT_CULL, SHAFT_TEST
+from workbench.geometry.planes import clip_by_plane
 
 UNSEEN, CLEAR, CUT, RAYS, NEAR = 0, 1, 2, 3, 4
 """What is known of a pair: nothing yet, NOT_INSHADOW, COMPLEX with a short list, COMPLEX left to rays, and
@@ -47,8 +48,10 @@ CUTS = 40
 """Longest candidate list that is cut."""
 SUMMED = 16
 """Pieces of a cluster that are seen one by one; with more, its samples stand for it."""
-DIP = 0.5
-"""Depth of a shadow, as a share of the open form factor, that may hide between points that agree."""
+UNEVEN = 15.0
+"""What an uneven sender counts against a receiver's own detail (measured on rooms)."""
+SHADOW_CORNERS = 12
+"""Most corners of a quad's part in the shadow of a piece of the scene, with room to spare."""
 
 
 @njit(nogil=True, cache=True)
@@ -283,8 +286,94 @@ def _share_at(points, count, x, y, tree, geo, found, many, limit, work, values, 
 
 
 @njit(nogil=True, cache=True)
+def _shadow(x, y, z, c0, c1, corners, nx, ny, nz, slack, ring, count, one, two, middle):
+    """Area of the part of a flat ``ring[:count]`` that the piece ``c0..c1`` hides from a point; ``middle`` of it.
+
+    The ring is clipped by the planes through the point and the piece's edges, and by the piece's own plane.
+    """
+    cx = cy = cz = 0.0
+    for i in range(c0, c1):
+        cx += corners[i, 0]
+        cy += corners[i, 1]
+        cz += corners[i, 2]
+    cx, cy, cz = cx / (c1 - c0), cy / (c1 - c0), cz / (c1 - c0)
+    d = nx * cx + ny * cy + nz * cz
+    if nx * x + ny * y + nz * z > d:
+        nx, ny, nz, d = -nx, -ny, -nz, -d
+    used = clip_by_plane(ring, count, nx, ny, nz, d, slack, one)
+    last = c1 - 1
+    for i in range(c0, c1):
+        if used < 3:
+            return 0.0
+        ax, ay, az = corners[last, 0] - x, corners[last, 1] - y, corners[last, 2] - z
+        bx, by, bz = corners[i, 0] - x, corners[i, 1] - y, corners[i, 2] - z
+        last = i
+        nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        length = math.sqrt(nx * nx + ny * ny + nz * nz)
+        if length == 0.0:
+            continue
+        if nx * (cx - x) + ny * (cy - y) + nz * (cz - z) < 0.0:
+            length = -length
+        nx, ny, nz = nx / length, ny / length, nz / length
+        used = clip_by_plane(one, used, nx, ny, nz, nx * x + ny * y + nz * z, slack, two)
+        one, two = two, one
+    if used < 3:
+        return 0.0
+    total = middle[0] = middle[1] = middle[2] = 0.0
+    for i in range(1, used - 1):
+        ux, uy, uz = one[i, 0] - one[0, 0], one[i, 1] - one[0, 1], one[i, 2] - one[0, 2]
+        vx, vy, vz = one[i + 1, 0] - one[0, 0], one[i + 1, 1] - one[0, 1], one[i + 1, 2] - one[0, 2]
+        wx, wy, wz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        part = 0.5 * math.sqrt(wx * wx + wy * wy + wz * wz)
+        total += part
+        for axis in range(3):
+            middle[axis] += part * (one[0, axis] + one[i, axis] + one[i + 1, axis]) / 3.0
+    if total <= 0.0:
+        return 0.0
+    for axis in range(3):
+        middle[axis] /= total
+    return total
+
+
+@njit(nogil=True, cache=True)
+def _hidden(x, y, tree, geo, found, many, rings, middle):
+    """How much the view of node ``y`` varies over node ``x`` by shadows, as a share of the open one.
+
+    The outlines of what lies between are projected from the middle of ``y`` onto ``x``: a shadow on a share s
+    of it, of the depth d at its middle, is a deviation of d sqrt(s (1 - s)).  It finds what hides between points
+    that agree: a thin shadow between lit corners, or a gap between dark ones.
+    """
+    area = shade = 0.0
+    own, other, one, two = rings[0], rings[1], rings[2], rings[3]
+    s0, s1 = tree.starts[tree.piece0[x]], tree.starts[tree.piece0[x] + 1]
+    t0, t1 = tree.starts[tree.piece0[y]], tree.starts[tree.piece0[y] + 1]
+    for axis in range(3):
+        for i in range(s0, s1):
+            own[i - s0, axis] = tree.corners[i, axis]
+        for i in range(t0, t1):
+            other[i - t0, axis] = tree.corners[i, axis]
+    cx, cy, cz = tree.centroid[y, 0], tree.centroid[y, 1], tree.centroid[y, 2]
+    for c in range(many):
+        p = found[c]
+        c0, c1 = geo.piece_start[p], geo.piece_start[p + 1]
+        nx, ny, nz = geo.normal[p, 0], geo.normal[p, 1], geo.normal[p, 2]
+        part = _shadow(cx, cy, cz, c0, c1, geo.corners, nx, ny, nz, geo.slack, own, s1 - s0, one, two, middle)
+        if part > 0.0:
+            depth = _shadow(
+                middle[0], middle[1], middle[2], c0, c1, geo.corners, nx, ny, nz, geo.slack, other, t1 - t0, one, two,
+                middle,
+            )  # fmt: skip
+            area += part
+            shade += part * min(depth / tree.area[y], 1.0) * (1.0 - geo.through[p])
+    if area <= 0.0:
+        return 0.0
+    share = min(area / tree.area[x], 1.0)
+    return shade / area * math.sqrt(share * (1.0 - share))
+
+
+@njit(nogil=True, cache=True)
 def measure(
-    first, last, a, b, state, offset, count, pool, bright, tree, geo, piece_area, limit, exchange, vary_a, vary_b,
+    first, last, a, b, state, offset, count, pool, bright, tree, geo, limit, exchange, vary_a, vary_b,
     doubt, new_count, new_pool, work, tally,
 ):  # fmt: skip
     """Measure the pairs ``first..last``: exchange area, variation of F over each end, doubt of the exchange.
@@ -298,6 +387,7 @@ def measure(
     va, vb = np.empty(NODE_SAMPLES), np.empty(NODE_SAMPLES)
     cell = np.empty((4, 3))
     given = np.empty(MAX_CANDIDATES, dtype=np.int64)
+    rings, middle = np.empty((4, SHADOW_CORNERS, 3)), np.empty(3)
     position = 0
     for i in range(first, last):
         x, y = a[i], b[i]
@@ -321,13 +411,14 @@ def measure(
             continue
         many = 0
         both = flat_a and flat_b
+        single = both and tree.piece1[x] - tree.piece0[x] == 1 and tree.piece1[y] - tree.piece0[y] == 1
         if both and state[i] != PART_OF_CLEAR:
             known = count[i]
             for c in range(known):
                 given[c] = pool[offset[i] + c]
             many = candidates(x, y, tree, geo, given, known, work.found, planes, tally)
             if (
-                many > 0 and tree.piece1[x] - tree.piece0[x] == 1 and tree.piece1[y] - tree.piece0[y] == 1
+                many > 0 and single
                 and _group_is_dark(
                     geo.corners, geo.piece_start, geo.through, work.found, many, tree.corners,
                     tree.starts[tree.piece0[x]], tree.starts[tree.piece0[x] + 1], tree.starts[tree.piece0[y]],
@@ -429,20 +520,16 @@ def measure(
                 exchange[i] = value * share
                 own, other = (open_a, open_b) if at_a else (open_b, open_a)
                 area = tree.area[x] if at_a else tree.area[y]
-                if share <= 0.0 or share > 1.0 - 1e-9:
-                    # Points that agree may hide a shadow, or a gap, as small as what lies between.
-                    blockers = 0.0
-                    for c in range(many):
-                        blockers += piece_area[work.found[c]]
-                    hidden = DIP * own * math.sqrt(min(blockers / area, 1.0))
-                    if state[i] == PART_OF_CUT:
-                        # The whole was looked at, too: what hides from both is smaller.
-                        hidden = min(hidden, 0.5 * (vary_a[i] if at_a else vary_b[i]))
-                    deviation = max(deviation, hidden)
+                if single:
+                    hidden_a = _hidden(x, y, tree, geo, work.found, many, rings, middle)
+                    hidden_b = _hidden(y, x, tree, geo, work.found, many, rings, middle)
+                else:
+                    hidden_a = hidden_b = 0.0
+                deviation = max(deviation, own * (hidden_a if at_a else hidden_b))
                 state[i] = CUT
                 doubt[i] = doubt[i] * share + 0.35 * deviation * area
                 # The other end's visibility is taken to vary as much, relative to its form factor.
-                spread = other * deviation / own
+                spread = max(other * deviation / own, other * (hidden_b if at_a else hidden_a))
                 if at_a:
                     vary_a[i] = deviation
                     vary_b[i] = max(open_vary_b * share, spread)
@@ -544,8 +631,46 @@ def apply_rays(pairs, counts, a, b, whole, starts, weights, blocked, area, excha
 
 
 @njit(nogil=True, cache=True)
+def _contrast(sender, receiver, bright, uneven, received):
+    """What a form factor that is off by itself alone puts in the wrong place, per unit of it.
+
+    Where rows are balanced (``received`` is positive) it takes from all others what it adds: only what the
+    sender is brighter or darker than they are counts.
+    """
+    if received[receiver] <= 0.0:
+        return bright[sender]
+    off = bright[sender] - received[receiver]
+    return math.sqrt(off * off + uneven[sender] * uneven[sender])
+
+
+@njit(nogil=True, cache=True)
+def link_errors(a, b, vary_a, vary_b, doubt, area, bright, uneven, received, node_area, over, under, unsure, linear):
+    """Errors of all links by receiving node: sums of squares (``linear`` 0) or of magnitudes (1).
+
+    ``over`` and ``under`` are those over receivers and over senders, see :func:`judge`; ``unsure`` those of the
+    form factors, of either sign, always squares.
+    """
+    for i in range(a.shape[0]):
+        x, y = a[i], b[i]
+        if node_area[x] <= 0.0 or node_area[y] <= 0.0:
+            continue
+        for _ in range(2):
+            one = _contrast(y, x, bright, uneven, received)
+            own, far = one * vary_a[i], uneven[y] * vary_b[i] * area[y] / area[x]
+            if y != b[i]:
+                own, far = one * vary_b[i], uneven[y] * vary_a[i] * area[y] / area[x]
+            off = one * doubt[i] / area[x]
+            over[x] += own if linear else own * own
+            under[x] += far if linear else far * far
+            unsure[x] += off * off
+            if x == y:
+                break
+            x, y = y, x
+
+
+@njit(nogil=True, cache=True)
 def judge(
-    a, b, vary_a, vary_b, state, area, flat, size, bright, uneven, detail, bias, weight, share, can_split,
+    a, b, vary_a, vary_b, state, area, flat, size, bright, uneven, received, detail, bias, weight, share, can_split,
     error, verdict, need,
 ):  # fmt: skip
     """What to do with each pair: 0 keep, 1 split the first end, 2 the second.
@@ -556,7 +681,9 @@ def judge(
     mean square error over all surfaces is the sum over links of ``error * T * A / total``, and the
     root of each link's term is what is held below ``error``.
     ``share`` holds ``sqrt(A / total)``, ``weight`` that times what a receiver's own detail matters;
-    ``bright`` and ``uneven`` the mean and the deviation of each node's radiosity in units of the mean irradiance.
+    ``bright`` and ``uneven`` the mean and the deviation of each node's radiosity, and ``received`` its irradiance
+    where rows are balanced, in units of the mean irradiance.  What is uneven counts :data:`UNEVEN` times: it is of
+    one sign (near corners both the form factor and the radiosity are large) and shifts means.
     """
     for i in range(a.shape[0]):
         verdict[i] = 0
@@ -564,8 +691,10 @@ def judge(
         if state[i] <= 0:
             continue
         x, y = a[i], b[i]
-        own_a, own_b = bright[y] * vary_a[i], bright[x] * vary_b[i]
-        far_a, far_b = uneven[y] * vary_b[i] * area[y] / area[x], uneven[x] * vary_a[i] * area[x] / area[y]
+        own_a = _contrast(y, x, bright, uneven, received) * vary_a[i]
+        own_b = _contrast(x, y, bright, uneven, received) * vary_b[i]
+        far_a = UNEVEN * uneven[y] * vary_b[i] * area[y] / area[x]
+        far_b = UNEVEN * uneven[x] * vary_a[i] * area[x] / area[y]
         need_a = max(
             math.sqrt(own_a * max(own_a, detail[x])) * weight[x], math.sqrt(far_b * max(far_b, bias[y])) * share[y]
         )  # fmt: skip
@@ -591,7 +720,7 @@ def judge(
 
 
 @njit(nogil=True, cache=True)
-def tolerances(pairs, a, b, exchange, area, bright, weight, relative, floor, allowed):
+def tolerances(pairs, a, b, exchange, area, bright, uneven, received, weight, relative, floor, allowed):
     """Error of the exchange area that each pair may keep: ``relative`` if positive, else by ``floor``.
 
     ``floor`` bounds the error of the irradiance, weighed as in :func:`judge`.
@@ -602,7 +731,8 @@ def tolerances(pairs, a, b, exchange, area, bright, weight, relative, floor, all
         if relative > 0.0:
             allowed[i] = relative * exchange[k]
             continue
-        one, two = bright[y] * weight[x], bright[x] * weight[y]
+        one = _contrast(y, x, bright, uneven, received) * weight[x]
+        two = _contrast(x, y, bright, uneven, received) * weight[y]
         allowed[i] = math.inf
         if one > 0.0:
             allowed[i] = floor * area[x] / one

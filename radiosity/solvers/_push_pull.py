@@ -8,16 +8,51 @@ from numba import njit
 
 @njit(nogil=True, cache=True)
 def pull(values, count, opened, child, children, area):
-    """Area-weighted means of the leaves, for every node above them, in place; (nodes, bands)."""
+    """Area-weighted means of the leaves, for every node above them, in place; (nodes, bands).
+
+    A node without area (all covered) has 0.
+    """
     bands = values.shape[1]
     for n in range(count - 1, -1, -1):
         if opened[n] == 0:
             continue
         for band in range(bands):
-            total = 0.0
+            sum_of_parts = 0.0
             for k in range(child[n], child[n] + children[n]):
-                total += area[k] * values[k, band]
-            values[n, band] = total / area[n]
+                sum_of_parts += area[k] * values[k, band]
+            values[n, band] = sum_of_parts / area[n] if area[n] > 0.0 else 0.0
+
+
+@njit(nogil=True, cache=True)
+def total(values, count, opened, child, children):
+    """Sums over the leaves (nodes,), for every node above them, in place."""
+    for n in range(count - 1, -1, -1):
+        if opened[n] == 1:
+            values[n] = 0.0
+            for k in range(child[n], child[n] + children[n]):
+                values[n] += values[k]
+
+
+@njit(nogil=True, cache=True)
+def level(rows, count, opened, child, children, area):
+    """Cut row sums to what each may be at most, and hand what is cut to the nearest leaves with room, in place.
+
+    ``rows`` (nodes, 2) holds the means of the row sums and of their largest values; the means of the former are
+    kept for each node that has room.
+    """
+    rows[0, 0] = min(rows[0, 0], rows[0, 1])
+    for n in range(count):
+        if opened[n] == 0:
+            continue
+        rest, room = area[n] * rows[n, 0], 0.0
+        for k in range(child[n], child[n] + children[n]):
+            rows[k, 0] = min(rows[k, 0], rows[k, 1])
+            rest -= area[k] * rows[k, 0]
+            room += area[k] * (rows[k, 1] - rows[k, 0])
+        if rest > 0.0 and room > 0.0:
+            share = min(rest / room, 1.0)
+            for k in range(child[n], child[n] + children[n]):
+                rows[k, 0] += share * (rows[k, 1] - rows[k, 0])
 
 
 @njit(nogil=True, cache=True)
@@ -36,8 +71,8 @@ def push(values, count, opened, child, children):
 def sort_links(a, b, exchange, area, start, column, factor):
     """Both directions of every link, gathered by receiver: row ``n`` is ``start[n]:start[n + 1]``.
 
-    ``factor`` holds the form factor from the receiver to the sender ``column``.  A link of a node with
-    itself stands once.
+    ``factor`` holds the form factor from the receiver to the sender ``column``, 0 from one without area.  A link
+    of a node with itself stands once.
     """
     rows = start.shape[0] - 1
     start[:] = 0
@@ -51,11 +86,11 @@ def sort_links(a, b, exchange, area, start, column, factor):
     for i in range(a.shape[0]):
         x, y = a[i], b[i]
         column[place[x]] = y
-        factor[place[x]] = exchange[i] / area[x]
+        factor[place[x]] = exchange[i] / area[x] if area[x] > 0.0 else 0.0
         place[x] += 1
         if x != y:
             column[place[y]] = x
-            factor[place[y]] = exchange[i] / area[y]
+            factor[place[y]] = exchange[i] / area[y] if area[y] > 0.0 else 0.0
             place[y] += 1
 
 

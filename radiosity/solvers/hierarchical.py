@@ -11,6 +11,9 @@ from them:
   clear, and a part of any other chooses its candidates among the whole's;
 * a link keeps the exchange area of both directions, so reciprocity is exact; in a scene declared
   closed the rows are balanced to sum to 1 without breaking it;
+* light is exchanged by the bare parts of what is covered, and row sums above 1 are levelled with their
+  neighbours' in open scenes: cutting them alone would lose light;
+* a pair whose sender is uneven is split sooner: the product of two means misses what is bright where it is near;
 * what a link may be off is weighed by its receiver's share of all area, so that the sum of squares
   over all links estimates the mean square error: shadow edges end by themselves;
 * the equations are solved by conjugate gradients over push and pull, which near reflectance 1 needs
@@ -43,11 +46,12 @@ from radiosity.solvers._pairs import (
     apply_rays,
     finish,
     judge,
+    link_errors,
     measure,
     pair_rays,
     tolerances,
 )
-from radiosity.solvers._push_pull import deviations, expand, gather, pull, push, sort_links
+from radiosity.solvers._push_pull import deviations, expand, gather, level, pull, push, sort_links, total
 from radiosity.solvers.incident import cosine_directions, incident_irradiance, incident_spread, points_of_elements
 from radiosity.solvers.progressive import remaining_bound
 from radiosity.solvers.solution import EnergyBook, Progress, ProgressEvent, Solution
@@ -96,8 +100,6 @@ LEAST_LOOSE, LOOSE_ROUNDS = 0.02, 20
 """Least share of a link that row balancing may scale, and rounds before everything is scaled."""
 COVER_POINTS, COVER_RAYS = (8, 16), (1, 6)
 """Points of an element, and rays from each, that tell how much of it is covered: of all, and of doubtful ones."""
-UNEVEN = 2.0
-"""What an uneven sender counts against a receiver's own detail: it shifts means, which reflection hands on."""
 PAIR_BYTES = 120
 """Memory that a new pair takes while it is measured, and as a link with both its directions."""
 SMALLEST = 2.0**-14
@@ -147,18 +149,34 @@ class _Links:
 class _Exchange:
     """The operator from radiosity of the leaves to their irradiance, over all links.
 
+    Only the bare part of what is covered in part (the floor under a box) exchanges light: means over a node are
+    weighed by the bare areas of its leaves, and what a link brings falls on the bare part of its end.
+
     Of each link a share is firm, and the rest, as much as its form factor varies over its ends, is loose:
     rows are balanced by scaling what is loose, so that the link from a lamp, which is known well, does
     not pay for a coarse one.
     """
 
-    def __init__(self, tree: Hierarchy, links: _Links, pool: ThreadPoolExecutor, *, with_unseen: bool = False) -> None:
-        self.tree, self.pool = tree, pool
-        self.leaves = tree.leaves()
-        self.area = tree.arrays.area[self.leaves]
+    def __init__(
+        self,
+        tree: Hierarchy,
+        leaves: IntArray,
+        bare: FloatArray,
+        links: _Links,
+        pool: ThreadPoolExecutor,
+        *,
+        with_unseen: bool = False,
+    ) -> None:
+        self.tree, self.leaves, self.pool = tree, leaves, pool
+        self.area = bare * tree.arrays.area[leaves]
+        self.node_area = np.zeros(tree.node_count)
+        self.node_area[leaves] = self.area
+        total(self.node_area, tree.node_count, tree.arrays.opened, tree.arrays.child, tree.arrays.children)
         self.scale = np.ones(len(self.leaves))
         self.loose_scale = np.ones(len(self.leaves))
         self.wanted: FloatArray | None = None
+        self.balanced = np.zeros(len(leaves), dtype=bool)
+        """Whether all that each row exchanges is known, so that it sums to 1."""
         self.links = links
         self.exchange = links.exchange if with_unseen else np.where(links.state > 0, links.exchange, 0.0)
         self.start = np.zeros(tree.node_count + 1, dtype=np.int64)
@@ -168,7 +186,7 @@ class _Exchange:
 
     def _sorted(self, exchange: FloatArray) -> FloatArray:
         links, factor = self.links, np.zeros(len(self.column))
-        sort_links(links.a, links.b, exchange, self.tree.arrays.area, self.start, self.column, factor)
+        sort_links(links.a, links.b, exchange, self.node_area, self.start, self.column, factor)
         return factor
 
     def up(self, values: FloatArray) -> FloatArray:
@@ -176,7 +194,7 @@ class _Exchange:
         arrays = self.tree.arrays
         nodes = np.zeros((self.tree.node_count, values.shape[1]))
         nodes[self.leaves] = values
-        pull(nodes, self.tree.node_count, arrays.opened, arrays.child, arrays.children, arrays.area)
+        pull(nodes, self.tree.node_count, arrays.opened, arrays.child, arrays.children, self.node_area)
         return nodes
 
     def down(self, nodes: FloatArray) -> FloatArray:
@@ -208,8 +226,7 @@ class _Exchange:
         """Scale rows and columns alike until the rows sum to ``wanted`` (n,).
 
         The symmetric scaling of :func:`radiosity.form_factors.matrix.close_rows`, first on what is loose; on
-        everything where that does not do.  Rows for which nothing is wanted are those of covered
-        elements, and exchange nothing.
+        everything where that does not do.
         """
         links, area = self.links, self.tree.arrays.area
         off = np.maximum(np.maximum(links.vary_a * area[links.a], links.vary_b * area[links.b]), links.doubt)
@@ -217,13 +234,10 @@ class _Exchange:
         share = np.clip(share, LEAST_LOOSE, 1.0)
         self.loose = self._sorted(self.exchange * share)
         self.firm = self._sorted(self.exchange * (1.0 - share))
-        self.scale[wanted <= 0.0] = 0.0
         one = np.ones((len(self.area), 1))
-        firm = self.scale * self._cross(self.firm, one * self.scale[:, None])[:, 0]
-        left = np.maximum(wanted - firm, LEAST_LOOSE * wanted)
+        left = np.maximum(wanted - self._cross(self.firm, one)[:, 0], LEAST_LOOSE * wanted)
         for _ in range(LOOSE_ROUNDS):
-            moved = self.scale * self.loose_scale
-            loose = moved * self._cross(self.loose, moved[:, None])[:, 0]
+            loose = self.loose_scale * self._cross(self.loose, self.loose_scale[:, None])[:, 0]
             self.loose_scale *= np.sqrt(np.divide(left, loose, out=np.ones_like(left), where=loose > 0))
         for _ in range(100):
             sums = self(one)[:, 0]
@@ -269,8 +283,6 @@ class _Solver:
         materials = [surface.material for surface in scene.surfaces]
         self.rho = np.stack([m.reflectance for m in materials])
         self.emission = np.stack([m.emission for m in materials])
-        first = geometry.piece_start[:-1]
-        self.piece_area = _piece_areas(geometry) if len(first) else np.zeros(0)
         longest = int(np.diff(geometry.piece_start).max(initial=4))
         self._idle = [workspace(max(longest, 4)) for _ in range(workers)]
         self.links = _Links.unseen(np.zeros(1, np.int32), np.zeros(1, np.int32))
@@ -278,7 +290,7 @@ class _Solver:
         self.total_area = float(self.tree.arrays.area[0])
         n = self.tree.node_count
         self.bright = np.zeros(n)
-        self.contrast = self.bright
+        self.received = np.zeros(n)
         self.uneven = np.zeros(n)
         self.detail = np.zeros(n)
         self.bias = np.zeros(n)
@@ -316,7 +328,7 @@ class _Solver:
             parent = self.tree.arrays.parent[old:n]
             # Parents come first: a cell's parent may itself be new, but never within one call of ``open``.
             self.bright = np.concatenate([self.bright, self.bright[parent]])
-            self.contrast = np.concatenate([self.contrast, self.contrast[parent]])
+            self.received = np.concatenate([self.received, self.received[parent]])
             self.uneven = np.concatenate([self.uneven, np.zeros(n - old)])
             self.detail = np.concatenate([self.detail, self.detail[parent]])
             self.bias = np.concatenate([self.bias, self.bias[parent]])
@@ -348,7 +360,7 @@ class _Solver:
             fresh = np.empty((last - first) * KEPT, dtype=np.int32)
             used = measure(
                 first, last, pairs.a, pairs.b, pairs.state, pairs.offset, pairs.count, self.candidates, self.bright,
-                self.tree.arrays, self.geo, self.piece_area, CUT_LIMIT, pairs.exchange, pairs.vary_a, pairs.vary_b,
+                self.tree.arrays, self.geo, CUT_LIMIT, pairs.exchange, pairs.vary_a, pairs.vary_b,
                 pairs.doubt, counts, fresh, scratch, tally,
             )  # fmt: skip
             narrowed[first] = fresh[:used].copy()
@@ -396,8 +408,8 @@ class _Solver:
         verdict, need = np.empty(len(pairs), dtype=np.int8), np.empty(len(pairs))
         judge(
             pairs.a, pairs.b, pairs.vary_a, pairs.vary_b, pairs.state, self.tree.arrays.area, self.tree.arrays.flat,
-            self.tree.arrays.size, self.contrast, self.uneven, self.detail, self.bias, self.weight, self.plain,
-            self.can_split, error, verdict, need,
+            self.tree.arrays.size, self.bright, self.uneven, self.received, self.detail, self.bias, self.weight,
+            self.plain, self.can_split, error, verdict, need,
         )  # fmt: skip
         return verdict, need
 
@@ -405,8 +417,8 @@ class _Solver:
         """Bring kept pairs to the accuracy that the link error asks for."""
         allowed = np.empty(len(kept))
         tolerances(
-            kept, pairs.a, pairs.b, pairs.exchange, self.tree.arrays.area, self.contrast, self.plain, self.relative,
-            FINISHED * error, allowed,
+            kept, pairs.a, pairs.b, pairs.exchange, self.tree.arrays.area, self.bright, self.uneven, self.received,
+            self.plain, self.relative, FINISHED * error, allowed,
         )  # fmt: skip
 
         def work(first: int, last: int, scratch: Any, tally: NDArray) -> None:
@@ -635,50 +647,45 @@ class _Solver:
         links = self.links
         return bool(((links.state <= 0) & ((self.bright[links.a] > 0) | (self.bright[links.b] > 0))).any())
 
-    def illuminate(self, radiosity: FloatArray, exchange: _Exchange, unit: FloatArray) -> None:
-        """Take the brightness of all nodes from the radiosity of the leaves."""
+    def illuminate(self, radiosity: FloatArray, irradiance: FloatArray, exchange: _Exchange, unit: FloatArray) -> None:
+        """Take the brightness of all nodes from the radiosity and irradiance (n, bands) of the leaves."""
         relative = radiosity / unit
         mean = exchange.up(relative)
         square = exchange.up(relative**2)
         self.bright = mean.max(axis=1)
-        self.contrast = self.bright
-        if self.scene.closed and not self.waiting():
-            # In balanced rows a form factor that is too large takes from all others: toward the dark, too, it
-            # puts light in the wrong place.
-            self.contrast = np.maximum(self.bright, float(relative.mean(axis=1) @ exchange.area) / self.total_area)
         self.uneven = np.empty(len(mean))
         deviations(square, mean, self.uneven)
-        self.uneven *= UNEVEN
+        whole = exchange.up(exchange.balanced[:, None].astype(np.float64))[:, 0] > 1.0 - 1e-9
+        self.received = np.where(whole, exchange.up(irradiance / unit).max(axis=1), 0.0)
         self._weigh()
 
-    def accumulate(self, exchange: _Exchange) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Errors of all links to each leaf, in units of the mean irradiance (leaves,).
-
-        Detail and bias (see :func:`radiosity.solvers._pairs.judge`) add up; the doubts of form factors, of
-        either sign, add in squares.  Keeps the first two as means for every node.
-        """
-        links, n = self.links, self.tree.node_count
-        area, bright, uneven = self.tree.arrays.area, self.contrast, self.uneven
-        a, b = links.a, links.b
-        two = np.where(a == b, 0.0, 1.0)  # a link of a node with itself receives once
-
-        def at_leaves(one: FloatArray, other: FloatArray) -> FloatArray:
-            nodes = np.asarray(np.bincount(a, one, n) + np.bincount(b, other * two, n), dtype=np.float64)
-            return exchange.down(nodes[:, None])[:, 0]
-
-        detail = at_leaves(bright[b] * links.vary_a, bright[a] * links.vary_b)
-        bias = at_leaves(
-            uneven[b] * links.vary_b * area[b] / area[a], uneven[a] * links.vary_a * area[a] / area[b]
-        )  # fmt: skip
-        doubt = at_leaves((bright[b] * links.doubt / area[a]) ** 2, (bright[a] * links.doubt / area[b]) ** 2)
+    def accumulate(self, exchange: _Exchange) -> None:
+        """Keep what the links are off, added up for every node, for the next round."""
+        detail, bias, _ = self._errors(exchange, linear=True)
         self.detail, self.bias = exchange.up(np.column_stack([detail, bias])).T.copy()
-        return detail, bias, np.sqrt(doubt)
 
+    def stated_errors(self, exchange: _Exchange) -> dict[str, float]:
+        """Root mean square errors of the irradiance over all surfaces, in units of its mean.
 
-def _piece_areas(geometry: Geometry) -> FloatArray:
-    triangles, piece = geometry.triangles
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    return np.bincount(piece, 0.5 * np.linalg.norm(cross, axis=1), geometry.piece_count).astype(np.float64)
+        What the links to one receiver are off over it is neither of one sign (as in a shadow, which is dark for
+        all senders) nor independent: the geometric mean of their sum and of the root of their squares' sum
+        was seen to be 1.0 to 1.5 times the error in rooms.
+        """
+        squares, sums = self._errors(exchange, linear=False), self._errors(exchange, linear=True)
+        means = [sums[0] * np.sqrt(squares[0]), sums[1] * np.sqrt(squares[1]), squares[2]]
+        parts = [math.sqrt(float(exchange.area @ part) / self.total_area) for part in means]
+        names = ("over_receivers", "over_senders", "form_factors")
+        return dict(zip(names, parts, strict=True)) | {"total": math.hypot(*parts)}
+
+    def _errors(self, exchange: _Exchange, *, linear: bool) -> list[FloatArray]:
+        """Errors of all links to each leaf (leaves,): over receivers, over senders, of form factors."""
+        links, arrays = self.links, self.tree.arrays
+        nodes = np.zeros((3, self.tree.node_count))
+        link_errors(
+            links.a, links.b, links.vary_a, links.vary_b, links.doubt, arrays.area, self.bright, self.uneven,
+            self.received, exchange.node_area, nodes[0], nodes[1], nodes[2], linear,
+        )  # fmt: skip
+        return list(exchange.down(nodes.T.copy()).T)
 
 
 def _conjugate_gradients(
@@ -709,12 +716,12 @@ def _conjugate_gradients(
     return z
 
 
-def _row_targets(solver: _Solver, exchange: _Exchange, closed: bool) -> tuple[FloatArray, FloatArray]:
+def _row_targets(solver: _Solver, exchange: _Exchange) -> tuple[FloatArray, FloatArray]:
     """Row sums wanted of the leaves, and those found; puts the latter and their doubt into the record."""
-    links, record = solver.links, solver.record
+    links, record, tree = solver.links, solver.record, exchange.tree
     sums = exchange(np.ones((len(exchange.area), 1)))[:, 0]
-    n = exchange.tree.node_count
-    area = exchange.tree.arrays.area[:n]
+    n = tree.node_count
+    area = np.where(exchange.node_area > 0, exchange.node_area, math.inf)
     a, b, known = links.a, links.b, links.state > 0
     other = known & (a != b)
     off = np.asarray(np.bincount(a, np.where(known, links.doubt, 0.0), n), dtype=np.float64)
@@ -732,46 +739,50 @@ def _row_targets(solver: _Solver, exchange: _Exchange, closed: bool) -> tuple[Fl
         "stated_error": float(stated.max()),
         "rows": len(sums),
     }
-    bare = solver.bare(exchange.leaves)
-    if closed:
-        return np.where(sums > 0.0, bare, 0.0), sums
+    # Pairs that stayed dark on both sides were never measured: what is known of their rows is no whole.
+    dark = ~known
+    unseen = np.asarray(np.bincount(a[dark], minlength=n) + np.bincount(b[dark], minlength=n), dtype=np.float64)
+    whole = exchange.down(unseen[:, None])[:, 0] == 0.0
+    most = np.where(whole, 1.0, np.minimum(sums, 1.0))
+    if solver.scene.closed:
+        exchange.balanced = whole & (sums > 0.0)
+        return np.where(sums > 0.0, most, 0.0), sums
     # Rows above 1 are errors as those below are; cutting only the former would lose light.
-    most = 1.0 if sums.max() * solver.rho.max() >= 1.0 else np.inf
-    return np.minimum(sums, np.where((bare > 0.0) & (bare < 1.0), bare, most)), sums
+    nodes = np.zeros((n, 2))
+    nodes[exchange.leaves, 0], nodes[exchange.leaves, 1] = sums, most
+    arrays = tree.arrays
+    pull(nodes, n, arrays.opened, arrays.child, arrays.children, exchange.node_area)
+    level(nodes, n, arrays.opened, arrays.child, arrays.children, exchange.node_area)
+    return nodes[exchange.leaves, 0], sums
 
 
 def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, limit: float) -> None:
     """Solve for the leaves over the links there are; fills the solution and its energy book."""
     mesh, book = solution.mesh, solution.book
     area = exchange.area
-    bare = solver.bare(exchange.leaves)
     if exchange.wanted is None:
-        # Rows are whole only once all links that carry light are there.
-        closed = solver.scene.closed and not solver.waiting()
-        exchange.wanted, found = _row_targets(solver, exchange, closed)
-        if closed or (exchange.wanted < found).any():
+        exchange.wanted, found = _row_targets(solver, exchange)
+        if (exchange.wanted != found).any():
             exchange.balance(exchange.wanted)
-    bare = np.where(bare > 0, bare, 1.0)[:, None]
     incident = solution.direct_irradiance
     sent = mesh.emission + mesh.reflectance * incident
-    back = mesh.reflectance / bare
-    root = np.sqrt(back)
-    # Of an element that is covered in part all values are those of its bare part, of share v, which alone
-    # exchanges light.  E = (K / v) (s + R E) with K symmetric: with R' = R / v, z = sqrt(R') v E solves
-    # (1 - sqrt(R') K sqrt(R')) z = sqrt(R') K s.
+    root = np.sqrt(mesh.reflectance)
+    # E = K (s + R E) with K symmetric: z = sqrt(R) E solves (1 - sqrt(R) K sqrt(R)) z = sqrt(R) K s.
     right = root * exchange(sent)
-    start = root * bare * (solution.element_irradiance - incident)
+    start = root * (solution.element_irradiance - incident)
     z = _conjugate_gradients(lambda v: v - root * exchange(root * v), right, start, area, limit)
     seen = sent + root * z
     arriving = exchange(seen)
-    solution.element_irradiance = incident + arriving / bare
+    solution.element_irradiance = incident + arriving
     solution.radiosity = mesh.emission + mesh.reflectance * solution.element_irradiance
     # What was sent of what leaves: the rest, a residual, is yet unshot.
+    bare = (area / mesh.element_area)[:, None]
     solution.unshot = bare * (solution.radiosity - seen)
-    book.emitted = area @ (mesh.emission + bare * incident)
-    book.shot = area @ (bare * seen + (1.0 - bare) * mesh.emission)
-    book.received = area @ (bare * incident + arriving)
-    book.absorbed = area @ ((1.0 - mesh.reflectance) * (bare * incident + arriving))
+    covered = (mesh.element_area - area) @ mesh.emission
+    book.emitted = covered + area @ (mesh.emission + incident)
+    book.shot = covered + area @ seen
+    book.received = area @ (incident + arriving)
+    book.absorbed = area @ ((1.0 - mesh.reflectance) * (incident + arriving))
     book.escaped = book.shot - area @ arriving
 
 
@@ -802,9 +813,10 @@ def solve_hierarchical(
     link_error : float, optional
         Largest error that one link may leave, as a share of the mean irradiance of the scene: the
         deviation of the link's light over its receiver, times the root of the receiver's share of
-        all area.  Squares of all links' errors add up to about the mean square error of the
-        irradiance, reported as ``link_error_estimate``.  ``None`` with ``max_elements``: as small as that
-        number allows.
+        all area.  Where all rows are known to sum to 1, light counts by how much it differs from what the
+        receiver gets from elsewhere.  The errors of all links give the root mean square error of the
+        irradiance, element by element, stated as ``link_error_estimate``.  ``None`` with
+        ``max_elements``: as small as that number allows.
     max_edge : float, optional
         Split everything until no flat element is longer than this, whatever its links.  [scene lengths]
     min_edge : float, optional
@@ -921,7 +933,7 @@ def _rounds(solver: _Solver, link_error: float | None, tolerance: float, progres
             solution, exchange = _solved(solver, limit=1e-3, interrupted=bool(stopped))
             found = solution.mean_irradiance
             unit = np.where(found > 0, found, unit)
-            solver.illuminate(solution.radiosity, exchange, unit)
+            solver.illuminate(solution.radiosity, solution.element_irradiance, exchange, unit)
             solver.accumulate(exchange)
         if stopped:
             break
@@ -947,8 +959,8 @@ def _first_light(solver: _Solver) -> FloatArray:
     if scene.closed:
         unit = unit / (1.0 - np.minimum(area @ rho / area.sum(), 0.99))
     unit = np.where(unit > 0, unit, max(float(unit.max(initial=0.0)), 1e-300))
-    none = _Exchange(tree, solver.links.take(np.zeros(0, dtype=np.int64)), solver.pool)
-    solver.illuminate(emission + rho * incident, none, unit)
+    none = _Exchange(tree, leaves, np.ones(len(leaves)), solver.links.take(np.zeros(0, dtype=np.int64)), solver.pool)
+    solver.illuminate(emission + rho * incident, incident, none, unit)
     return unit
 
 
@@ -956,10 +968,12 @@ def _solved(solver: _Solver, *, limit: float, interrupted: bool) -> tuple[Soluti
     """The solution over the links and leaves that there are."""
     tree = solver.tree
     # What waits for light carries none; what was about to be measured has its share of a measured link.
-    exchange = _Exchange(tree, solver.links, solver.pool, with_unseen=interrupted)
-    mesh = tree.mesh(exchange.leaves)
-    bare = solver.bare(exchange.leaves)[:, None]
-    incident = np.divide(solver.incident(exchange.leaves), bare, out=np.zeros((len(bare), mesh.bands)), where=bare > 0)
+    leaves = tree.leaves()
+    bare = solver.bare(leaves)
+    exchange = _Exchange(tree, leaves, bare, solver.links, solver.pool, with_unseen=interrupted)
+    mesh = tree.mesh(leaves)
+    incident = np.zeros((len(bare), mesh.bands))
+    np.divide(solver.incident(leaves), bare[:, None], out=incident, where=bare[:, None] > 0)
     solution = Solution(
         scene=solver.scene,
         mesh=mesh,
@@ -984,11 +998,7 @@ def _report(solver: _Solver, solution: Solution, exchange: _Exchange) -> None:
     record.errors["energy_imbalance"] = solution.book.imbalance(solution.unshot_power)
     # Both directions of a link are one number.
     record.errors["reciprocity"] = 0.0
-    parts = solver.accumulate(exchange)
-    record.errors["link_error_estimate"] = {
-        name: math.sqrt(float(exchange.area @ part**2) / solver.total_area)
-        for name, part in zip(("over_receivers", "over_senders", "form_factors"), parts, strict=True)
-    }
+    record.errors["link_error_estimate"] = solver.stated_errors(exchange)
     record.errors["facet_error"] = solution.mesh.facet_error
     record.results.update(
         elements=solution.mesh.element_count,

@@ -10,6 +10,8 @@ from radiosity_scenes import UNIT, cube_with_emitter, each_truth, standing_box, 
 
 import radiosity
 import workbench
+from radiosity.accuracy import surface_points
+from radiosity.element_lookup import ElementLookup
 from radiosity.form_factors.analytic import point_to_polygon
 from radiosity.hierarchy import Hierarchy
 from radiosity.solvers import hierarchical
@@ -153,7 +155,7 @@ def test_it_agrees_with_the_direct_solver_on_the_same_elements(scene):
         RunRecord(command="solve"),
         max_edge=0.26,
         min_edge=0.2,
-        link_error=2e-4,
+        link_error=2e-5 if scene == "cube" else 2e-4,
         form_factor_error=1e-3,
     )
     order, wanted = (np.lexsort(np.round(s.mesh.element_centroid, 6).T) for s in (solution, judge))
@@ -181,6 +183,55 @@ def test_smaller_link_errors_bring_smaller_errors():
         counts.append((solution.mesh.element_count, solution.record.results["links"]))
     assert counts[0] < counts[1] < counts[2]
     assert counts[2][1] < 40 * counts[2][0]
+
+
+def opposite_wall(solution):
+    """Elements of the wall opposite the emitter of ``cube_with_emitter``, and their irradiance if all is black."""
+    mesh = solution.mesh
+    wall = np.flatnonzero(mesh.element_centroid[:, 2] == 1)
+    emitter = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    return wall, point_to_polygon(mesh.element_centroid[wall], np.tile([0, 0, -1.0], (len(wall), 1)), emitter)
+
+
+def test_rows_of_which_the_dark_part_was_never_measured_are_not_closed():
+    # All black: only the emitter's links are measured, and what they bring is all there is.
+    solution = solve(cube_with_emitter(0.0, 0.0), link_error=2e-3)
+    assert solution.scene.closed
+    wall, exact = opposite_wall(solution)
+    assert solution.element_irradiance[wall, 0] == pytest.approx(exact, rel=0.02)
+
+
+def test_row_sums_above_one_are_levelled_without_losing_light():
+    # Of an open scene: cutting them to 1 made the Cornell box 1.4 % too dark at this error.
+    scene = workbench.load("cornell-box")
+    judge = radiosity.solve(scene, method="matrix", elements=400, form_factor_error=2e-3, workers=1)
+    solution = solve(scene, link_error=3e-3)
+    assert solution.record.errors["row_sum"]["max"] > 1.05
+    power = [s.book.absorbed + s.book.escaped for s in (solution, judge)]
+    assert power[0] == pytest.approx(power[1], rel=1e-6)
+    absorbed = [s.book.absorbed[0] for s in (solution, judge)]
+    assert absorbed[0] == pytest.approx(absorbed[1], rel=0.01)
+
+
+@pytest.mark.parametrize("error", [3e-2, 3e-3])
+@pytest.mark.parametrize("name", ["emitter", "sheet", "furnace"])
+def test_the_stated_error_is_within_a_factor_of_three(name, error):
+    if name == "furnace":
+        # e / (1 - rho) everywhere: in balanced rows form factors may vary as they like.
+        solution = solve(unit_cube(0.5, 1.0), link_error=error)
+        stated = solution.record.errors["link_error_estimate"]["total"]
+        assert np.abs(solution.element_irradiance - 2.0).max() < 1e-6 and stated < 1e-3
+        return
+    scene = cube_with_emitter(0.0, 0.0) if name == "emitter" else sheet_over_floor(0.5)
+    solution = solve(scene, link_error=error)
+    mesh = solution.mesh
+    points, normals, polygon = surface_points(mesh, 2000, seed=1)
+    # Black but for the emitter: all light is direct, and what the points find of it is exact.
+    exact = solution.irradiance(points, normals, own_polygon=polygon, error=1e-3).irradiance[:, 0]
+    rows = ElementLookup.build(Geometry.from_scene(scene), mesh).elements(points, polygon, np.full(len(points), True))
+    actual = np.sqrt(((solution.element_irradiance[rows, 0] - exact) ** 2).mean()) / exact.mean()
+    stated = solution.record.errors["link_error_estimate"]["total"]
+    assert actual / 3 < stated < 3 * actual
 
 
 @pytest.mark.parametrize("elements", [1, 40, 500])
