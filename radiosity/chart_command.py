@@ -19,7 +19,7 @@ from workbench.errors import InputError, OptionError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from radiosity.report.speed_accuracy import Point
+    from radiosity.report.speed_accuracy import Point, Run
     from radiosity.report.techniques import Problem, Reference
     from workbench.scene.model import Scene
 
@@ -59,6 +59,7 @@ LIMIT = 5.0
 @click.option("--points", type=click.IntRange(2, 1 << 20), metavar="N", help="solve: points.  [default: 256]")
 @click.option("--width", type=click.IntRange(4, 4096), metavar="PIXELS", help="render, picture: across.  [default: 96]")
 @click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Threads.  [default: all cores]")
+@click.option("--compare", type=click.Path(path_type=Path), metavar="DIR", help="Another folder's chart of the same.")
 @click.option("-o", "--output", "directory", type=click.Path(path_type=Path), required=True, metavar="DIR")
 def chart(
     scene: str,
@@ -74,6 +75,7 @@ def chart(
     points: int | None,
     width: int | None,
     workers: int | None,
+    compare: Path | None,
     directory: Path,
 ) -> None:
     """Chart error against seconds for techniques that answer one question to SCENE.
@@ -92,6 +94,9 @@ def chart(
     DIR already holds are not run again: an interrupted chart goes on, and new techniques or settings
     join an old record.  Rivals (mitsuba, radiance, pyviewfactor, trimesh) are left out with a reason
     where they are not installed.  Lamps reflect nothing, in all techniques.
+
+    --compare tells whether another chart was reproduced: all counts and errors of our own exactly, and
+    the order of the frontier within the spread of the seconds.  The exit code is 1 if not.
     """
     from workbench.record import check_folder
 
@@ -122,6 +127,7 @@ def chart(
     kind = reference or problem.default_reference
     told = {"scene": scene_digest(loaded), "what": what, "title": f"{loaded.name}: {problem.title}", "reference": kind}
     _same_record(directory, told)
+    earlier = _earlier(compare, told) if compare is not None else None
     directory.mkdir(parents=True, exist_ok=True)
     if not (directory / "record.json").exists():  # at once: an interrupted chart goes on from its runs
         from workbench.record import RunRecord
@@ -147,6 +153,8 @@ def chart(
     }  # fmt: skip
     for path in _write_report(directory, problem, judge, runs, notes, settings, workbench.__version__):
         click.echo(str(path))
+    if earlier is not None and not _reproduced(earlier, runs):
+        raise SystemExit(1)
 
 
 # ---- what was asked ---------------------------------------------------------------------------------
@@ -234,6 +242,35 @@ def _same_record(directory: Path, told: dict[str, Any]) -> None:
         raise InputError(f"{directory}: holds a record with another {changed[0]}; give another folder with -o")
 
 
+def _earlier(directory: Path, told: dict[str, Any]) -> list[Run]:
+    """Runs of another folder, if it holds the same question."""
+    from radiosity.report.speed_accuracy import read_runs
+
+    if not (directory / "records.csv").exists():
+        raise InputError(f"{directory}: found no records.csv; give the folder of a chart with --compare")
+    _same_record(directory, told)
+    return read_runs(directory / "records.csv")
+
+
+def _reproduced(earlier: list[Run], runs: list[Run]) -> bool:
+    """Say what differs between two records."""
+    from radiosity.report.speed_accuracy import compare
+
+    found = compare(earlier, runs)
+    click.echo(f"compared: {found.runs} runs that both have")
+    for what, differing in (("counts", found.counts), ("errors", found.errors)):
+        click.echo(f"{what} of our own: {f'{len(differing)} differ' if differing else 'all equal'}")
+        for line in differing:
+            click.echo(f"- {line}")
+    click.echo(
+        f"frontier: {found.frontier} settings; {len(found.swapped)} pairs swapped, {len(found.ties)} more within the"
+        " spread of their seconds"
+    )
+    for line in (*found.swapped, *(f"{pair} (within the spread)" for pair in found.ties)):
+        click.echo(f"- {line}")
+    return found.runs > 0 and not (found.counts or found.errors or found.swapped)
+
+
 def _reference(problem: Problem, kind: str, directory: Path) -> Reference:
     """The reference, kept in the folder."""
     import numpy as np
@@ -268,7 +305,7 @@ def _write_report(
     from matplotlib.figure import Figure
 
     from radiosity.report.page import html_page
-    from radiosity.report.speed_accuracy import auto_ratios, draw_chart, points_of
+    from radiosity.report.speed_accuracy import auto_ratios, draw_chart, points_of, seconds_to
     from workbench.record import RunRecord, write_text_atomically
     from workbench.study.result import format_table
 
@@ -289,9 +326,14 @@ def _write_report(
     ratios = {(p.method, p.value): ratio for p, ratio in auto_ratios(points)}
     rows = [_row(point, ratios) for point in points]
     click.echo(f"{settings['title']}\nerrors against {judge.name}\n\n{format_table(rows)}\n")
+    reached = seconds_to(points)
+    click.echo(f"Seconds to an error, on the frontier of ours and of each rival:\n\n{format_table(reached)}\n")
     for note in notes:
         click.echo(f"- {note}")
-    tables = {"Settings and what they cost": [{k: _text(v) for k, v in row.items()} for row in rows]}
+    tables = {
+        "Seconds to an error": [{k: _text(v) for k, v in row.items()} for row in reached],
+        "Settings and what they cost": [{k: _text(v) for k, v in row.items()} for row in rows],
+    }
     facts = (
         settings
         | {f"machine: {k}": v for k, v in machine.items()}
@@ -300,7 +342,7 @@ def _write_report(
     facts["error of the reference"] = f"{judge.error:.2g}"
     page = html_page(settings["title"], drawn.getvalue(), tables, notes, facts)
     write_text_atomically(directory / "report.html", page)
-    record.results = {"points": rows, "notes": notes, "reference error": judge.error}
+    record.results = {"points": rows, "seconds to an error": reached, "notes": notes, "reference error": judge.error}
     record.write(directory / "record.json")
     return [directory / name for name in ("records.csv", "chart.svg", "chart.png", "report.html", "record.json")]
 

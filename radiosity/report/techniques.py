@@ -139,6 +139,10 @@ def _rival_answers(name: str) -> frozenset[str]:
     return answers
 
 
+RIVAL_RUNS = 8
+"""Independent runs of a rival that make a reference: enough to know its variance."""
+
+
 def _repeated(ask: Callable[[int], FloatArray], name: str, runs: int = 4) -> Reference:
     """The mean of runs with different seeds, and its variance."""
     found = np.stack([ask(1000 + seed) for seed in range(runs)])
@@ -284,7 +288,8 @@ def _rival_reference(problem: Problem, kind: str, samples: int) -> Reference:
             f"reference: found {kind!r}, expected exact, converged, FILE.npy or a rival that answers this"
         )
     technique = problem.technique(kind)
-    return _repeated(lambda seed: technique.ask(samples, seed).values, f"{kind}, 4 x {samples:,} samples")
+    name = f"{kind}, {RIVAL_RUNS} x {samples:,} samples"
+    return _repeated(lambda seed: technique.ask(samples, seed).values, name, RIVAL_RUNS)
 
 
 # ---- view factors -------------------------------------------------------------------------------
@@ -518,20 +523,18 @@ class Solve(Problem):
 
     def _meshed(self, name: str, method: str, values: tuple[int, ...], gather: bool, **more: Any) -> Technique:
         def ask(value: float, seed: int) -> Answer:
-            # Finer meshes are worth better form factors, less light left and a better gather: a gathered mesh
-            # of n elements is off by about 0.3 / sqrt(n).
+            # Finer meshes are worth better form factors, less light left and a better gather: a gathered mesh of
+            # n elements is off by about 0.3 / sqrt(n) while n is small, then by 3 / n.
             fine = 0.3 / math.sqrt(value)
             options: dict[str, Any] = {"method": method, "elements": int(value)} | more
-            if method == "matrix":  # states the error of a row, the others that of a form factor
-                options["form_factor_error"] = 0.5 * fine
-            elif method != "hierarchical":  # which chooses better for itself
+            if method != "hierarchical":  # which chooses better for itself
                 options["form_factor_error"] = min(2.0 * fine, 0.2)
             if method not in ("direct", "matrix"):  # which know no light left unshot
                 options["tolerance"] = min(0.01, fine)
             solution = self._solved(options, seed)
             if not gather:
                 return Answer(self._read(solution), dict(solution.record.counters))
-            return Answer(*self._gathered(solution, min(0.05, fine), seed))
+            return Answer(*self._gathered(solution, min(0.1, 4.0 / value), seed))
 
         return Technique(name, "elements", values, ask)
 
@@ -544,7 +547,7 @@ class Solve(Problem):
             stated = math.hypot(float(solution.record.errors["estimate"]["total"]), self.gather_share * value)
             return Answer(values, counters, stated)
 
-        return Technique("auto", "error", (0.1, 0.05, 0.02), ask, kind="auto")
+        return Technique("auto", "error", (0.1, 0.05, 0.02, 0.01, 0.005), ask, kind="auto")
 
     def _hierarchical(self) -> Technique:
         return self._meshed("hierarchical", "hierarchical", (100, 400, 1600), False)
@@ -556,7 +559,7 @@ class Solve(Problem):
         return self._meshed("matrix", "matrix", (100, 400, 1600), False)
 
     def _matrix_gather(self) -> Technique:
-        return self._meshed("matrix+gather", "matrix", (16, 50, 200, 800, 2400), True)
+        return self._meshed("matrix+gather", "matrix", (16, 50, 200, 400, 800, 1600, 3200), True)
 
     def _progressive(self) -> Technique:
         return self._meshed("progressive", "progressive", (100, 400, 1600), False)
@@ -580,17 +583,17 @@ class Solve(Problem):
         def ask(value: float, seed: int) -> Answer:
             return Answer(rival.irradiance(self.points, self.normals, samples=int(value), seed=seed))
 
-        return Technique(name, "samples", (16, 64, 256, 1024), ask, kind="rival")
+        return Technique(name, "samples", (16, 64, 256, 1024, 4096), ask, kind="rival")
 
     def reference(self, kind: str) -> Reference:
-        """A progressive solve of 6,000 elements gathered to 0.1 %, or a rival of 4 x 32,768 samples."""
+        """A matrix solve of 4,000 elements gathered to 0.1 %, or 8 x 4,096 samples of a rival."""
         if kind == "exact":
             raise OptionError("reference: no exact answer is known for a solve; ask for converged, mitsuba or FILE.npy")
         if kind == "converged":
-            solution = self._solved({"method": "progressive", "elements": 6000, "tolerance": 2e-3}, 1)
-            values, _ = self._gathered(solution, 0.001, 1)
-            return Reference("progressive, 6,000 elements, gathered to 0.1 %", values, 0.0, 0.001)
-        return _rival_reference(self, kind, 32768)
+            fine = {"method": "matrix", "elements": 4000, "form_factor_error": 2e-3}
+            values, _ = self._gathered(self._solved(fine, 1), 0.001, 1)
+            return Reference("matrix, 4,000 elements, gathered to 0.1 %", values, 0.0, 0.001)
+        return _rival_reference(self, kind, 4096)
 
 
 # ---- pictures -----------------------------------------------------------------------------------
@@ -685,32 +688,37 @@ class Pictures(Problem):
         def ask(value: float, seed: int) -> Answer:
             return Answer(rival.picture(self.camera, samples=int(value), seed=seed, direct_only=self.direct_only))
 
-        return Technique(name, "samples a pixel", (1, 4, 16, 64, 256), ask, kind="rival")
+        return Technique(name, "samples a pixel", (1, 4, 16, 64, 256, 1024), ask, kind="rival")
 
     def reference(self, kind: str) -> Reference:
-        """The picture 16 times as large each way, averaged."""
+        """A final gather to 0.3 %, or 8 x 1,024 samples a pixel of a rival."""
         if kind == "exact":
             raise OptionError("reference: no exact picture is known; ask for converged, mitsuba or FILE.npy")
         if kind == "converged":
-            found = self._aliased().ask(16, 1)
-            return Reference("16 x 16 samples a pixel", found.values)
-        return _rival_reference(self, kind, 8192)
+            return Reference(
+                "final gather to 0.3 %", self._gathered(self._solution(0.003, 7), 0.003, 7).values, 0.0, 0.003
+            )
+        return _rival_reference(self, kind, 1024)
 
     def _gather(self) -> Technique:
-        def ask(value: float, seed: int) -> Answer:
-            return self._gathered(value, seed)
+        return Technique(
+            "gather", "error", (0.1, 0.05, 0.02, 0.01),
+            lambda value, seed: self._gathered(self._solution(value, seed), value, seed), kind="auto",
+        )  # fmt: skip
 
-        return Technique("gather", "error", (0.1, 0.05, 0.02), ask, kind="auto")
+    def _solution(self, error: float, seed: int) -> Any:
+        """A solve as good as the picture needs: of direct light, next to nothing."""
+        from radiosity.solvers.solve import solve
 
-    def _gathered(self, error: float, seed: int) -> Answer:
-        """A solve as good as the picture needs, and the final gather."""
-        from radiosity.accuracy import solve
+        least: dict[str, Any] = {"method": "progressive", "elements": 16, "tolerance": 0.9, "form_factor_error": 0.5}
+        return solve(self.scene, workers=self.workers, seed=seed, **least)
+
+    def _gathered(self, solution: Any, error: float, seed: int, *, atomic: bool = True) -> Answer:
+        """The final gather."""
         from radiosity.gather import GatherOptions, PictureGatherer
         from workbench.render.camera import PinholeRays
 
-        options: dict[str, Any] = {"elements": 16, "tolerance": 0.5} if self.direct_only else {"error": error}
-        solution = solve(self.scene, workers=self.workers, seed=seed, **options)
-        choice = GatherOptions(error=error, indirect=not self.direct_only, see_backs=True)
+        choice = GatherOptions(error=error, atomic=atomic, indirect=not self.direct_only, see_backs=True)
         gatherer = PictureGatherer(solution, choice, workers=self.workers, seed=seed)
         picture = gatherer.draw(PinholeRays.from_camera(self.camera))
         counters = Counters()
@@ -723,13 +731,63 @@ class GlobalPictures(Pictures):
     """A small picture of all the light, direct and reflected. [W m-2 sr-1]"""
 
     what, direct_only = "picture", False
-    own = ("gather",)
+    own = ("gather", "matrix+gather", "gather-every-pixel", "mesh")
 
-    def reference(self, kind: str) -> Reference:
-        """A final gather to 0.5 %."""
-        if kind == "converged":
-            return Reference("final gather to 0.5 %", self._gathered(0.005, 7).values, 0.0, 0.005)
-        return super().reference(kind)
+    def _solution(self, error: float, seed: int) -> Any:
+        from radiosity.accuracy import solve
+
+        return solve(self.scene, error=error, workers=self.workers, seed=seed)
+
+    def _matrix_solution(self, elements: float, seed: int) -> Any:
+        from radiosity.solvers.solve import solve
+
+        return solve(
+            self.scene, method="matrix", elements=int(elements), form_factor_error=0.15 / math.sqrt(elements),
+            workers=self.workers, seed=seed,
+        )  # fmt: skip
+
+    def _by_elements(self, name: str, values: tuple[int, ...], atomic: bool) -> Technique:
+        def ask(value: float, seed: int) -> Answer:
+            # A pixel's error is about that of a point under the same mesh.
+            error = min(0.1, 0.3 / math.sqrt(value))
+            return self._gathered(self._matrix_solution(value, seed), error, seed, atomic=atomic)
+
+        return Technique(name, "elements", values, ask)
+
+    def _matrix_gather(self) -> Technique:
+        return self._by_elements("matrix+gather", (16, 50, 200, 800), True)
+
+    def _gather_every_pixel(self) -> Technique:
+        return self._by_elements("gather-every-pixel", (16, 50, 200), False)
+
+    def _mesh(self) -> Technique:
+        """The elements themselves, as pictures of radiosity were drawn before gathers: no shadows but the mesh's."""
+        from radiosity.element_lookup import ElementLookup, element_gradients
+        from workbench.accel.embree import EmbreeAccelerator
+        from workbench.render.camera import PinholeRays
+
+        tracer, side = EmbreeAccelerator(self.geometry), 4
+        h, w = self.camera.height, self.camera.width
+        rays = PinholeRays.from_camera(replace(self.camera, width=side * w, height=side * h))
+
+        def ask(value: float, seed: int) -> Answer:
+            solution = self._matrix_solution(value, seed)
+            mesh = solution.mesh
+            lookup = ElementLookup.build(self.geometry, mesh)
+            slopes = element_gradients(mesh, lookup, solution.radiosity)
+            toward = rays.row_directions(0, side * h)
+            hit = tracer.closest_hit(np.broadcast_to(rays.eye, toward.shape), toward)
+            points = rays.eye + np.where(np.isfinite(hit.t), hit.t, 0.0)[:, None] * toward
+            front = np.einsum("ij,ij->i", self.geometry.polygon_normal[hit.polygon], toward) < 0.0
+            element = lookup.elements(points, hit.polygon, front)
+            known = np.maximum(element, 0)
+            found = solution.radiosity[known] + np.einsum(
+                "nbk,nk->nb", slopes[known], points - mesh.element_centroid[known]
+            )
+            seen = np.where((element >= 0)[:, None], np.maximum(found, 0.0), 0.0) / math.pi
+            return Answer(seen.reshape(h, side, w, side, -1).mean(axis=(1, 3)), dict(solution.record.counters))
+
+        return Technique("mesh", "elements", (100, 400, 1600), ask)
 
 
 def replace_camera(problem: Pictures, camera: Any) -> Pictures:

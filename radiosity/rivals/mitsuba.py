@@ -45,8 +45,9 @@ class Mitsuba(Rival):
     variant : str, optional
         Mitsuba's variant; ``llvm_ad_mono`` for one band and ``llvm_ad_rgb`` otherwise, bands in threes.
     sampler : str
-        Mitsuba's sampler for irradiance at points; ``stratified`` and ``multijitter`` take square numbers of
-        samples and leave about 60 % of the noise of ``independent`` at a thousand.
+        Mitsuba's sampler.  ``multijitter`` is its best here: of the noise of ``independent`` at 256 samples it
+        leaves a quarter for direct light and two thirds for all light.  It rounds the number of samples up to a
+        product of two near numbers.
 
     Raises
     ------
@@ -59,7 +60,7 @@ class Mitsuba(Rival):
     answers = frozenset({"direct", "irradiance", "picture"})
     light_kinds = frozenset({"point", "directional"})
 
-    def __init__(self, scene: Scene, variant: str | None = None, sampler: str = "independent") -> None:
+    def __init__(self, scene: Scene, variant: str | None = None, sampler: str = "multijitter") -> None:
         super().__init__(scene)
         self.sampler = sampler
         self.variant = variant or ("llvm_ad_mono" if scene.bands == 1 else "llvm_ad_rgb")
@@ -191,7 +192,7 @@ class Mitsuba(Rival):
                 "type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"},
                 "pixel_format": "luminance" if self.variant.endswith("mono") else "rgb", "component_format": "float32",
             },
-            "sampler": {"type": "independent", "sample_count": samples},
+            "sampler": {"type": self.sampler, "sample_count": samples},
         })  # fmt: skip
         # Two edges of a direct path: from the lamp to the surface, and on to the eye.
         integrator = mi.load_dict({"type": "path", "max_depth": 2 if direct_only else MAX_DEPTH})

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from radiosity.cli import main
+from radiosity.report.speed_accuracy import COUNTS
 from radiosity.report.techniques import PROBLEMS, problem_for
 from workbench.scene.load import load
 
@@ -47,6 +48,43 @@ def test_a_chart_of_shadows_grows(tmp_path):
     assert json.loads((folder / "record.json").read_text())["settings"]["what"] == "shadows"
     other = run("l-room", "--methods", "exact", "-o", str(folder))
     assert other.exit_code == 2 and "another scene" in other.output
+
+
+def test_a_rerun_reproduces_every_count(tmp_path):
+    """All that chance and threads could change: rays, adaptive shadows, bundles, links; a changed count is told."""
+    np.save(tmp_path / "ones.npy", np.ones((16, load("l-room").bands)))
+    small = {"shadows": ["cornell-box", "--grid", "8x8", "--methods", "auto,rays,shaft,adaptive,voxel+rayID"],
+             "solve": ["l-room", "--points", "16", "--reference", str(tmp_path / "ones.npy"),
+                       "--methods", "matrix+gather,directional+gather,hierarchical+gather",
+                       "--sweep", "elements=16,50"]}  # fmt: skip
+    for what, arguments in small.items():
+        question = [arguments[0], "--what", what, *arguments[1:], "--repeats", "1"]
+        first, second = tmp_path / f"{what}1", tmp_path / f"{what}2"
+        assert run(*question, "--workers", "2", "-o", str(first)).exit_code == 0
+        found = run(*question, "--workers", "1", "--compare", str(first), "-o", str(second))
+        assert "counts of our own: all equal" in found.output and "errors of our own: all equal" in found.output
+        assert f"{len(rows_of(first))} runs that both have" in found.output
+        keep = ("method", "value", "seed", "error", *COUNTS)
+        assert [[row[k] for k in keep] for row in rows_of(first)] == [[row[k] for k in keep] for row in rows_of(second)]
+    text = (first / "records.csv").read_text().splitlines()
+    cells = dict(zip(text[0].split(","), text[-1].split(","), strict=True))
+    cells["rays"] = str(int(cells["rays"]) + 1)
+    (first / "records.csv").write_text("\n".join([*text[:-1], ",".join(cells.values())]) + "\n")
+    found = run(*question, "--compare", str(first), "-o", str(second))
+    assert found.exit_code == 1 and "counts of our own: 1 differ" in found.output
+    assert run("cornell-box", "--compare", str(first), "-o", str(tmp_path / "c")).exit_code == 2
+
+
+def test_pictures_of_all_light_by_every_technique():
+    """At 24 x 24 pixels a gather of some elements is closer to a fine one than the mesh itself; all are finite."""
+    problem = problem_for("picture", load("cornell-box"), width=24)
+    judge = problem.judged(problem.technique("matrix+gather").ask(400, 3).values)
+    off = {}
+    for name, value in (("gather", 0.05), ("matrix+gather", 50), ("gather-every-pixel", 50), ("mesh", 100)):
+        found = problem.judged(problem.technique(name).ask(value, 3).values)
+        off[name] = float(np.sqrt(((found - judge) ** 2).mean()) / judge.mean())
+    assert max(off["gather"], off["matrix+gather"], off["gather-every-pixel"]) < 0.1
+    assert off["mesh"] > 2.0 * off["matrix+gather"]
 
 
 @pytest.mark.parametrize("arguments, said", [
@@ -120,7 +158,7 @@ def test_every_technique_is_on_a_chart():
         "solve": {f"{method}{gather}" for method in ("matrix", "progressive", "directional", "hierarchical", "direct")
                   for gather in ("", "+gather")} | {"auto", "mitsuba", "radiance"},
         "render": {"aliased", "adaptive", "atomic", "gather", "mitsuba", "radiance"},
-        "picture": {"gather", "mitsuba", "radiance"},
+        "picture": {"gather", "gather-every-pixel", "matrix+gather", "mesh", "mitsuba", "radiance"},
     }  # fmt: skip
     for what, names in expected.items():
         assert names <= set(PROBLEMS[what].names()), what

@@ -1,38 +1,68 @@
-"""The charts of README, all by one command, and the table of costs that is fitted to them.
+"""The charts of README by one command, the table of seconds to an error, and the costs that are fitted to them.
 
-    python tests/speed/bench_charts.py [-o out/charts] [--only NAME] [--fit]
+    python tests/speed/bench_charts.py [-o out/charts] [--only NAME] [--docs] [--fit] [--against FOLDER]
 
-Charts go on where they were interrupted.  ``--fit`` writes radiosity/report/cost_table.json from their
-records.  A quarter of an hour on two cores.
+Charts go on where they were interrupted; rivals that are not installed are left out with a reason.
+Prints, and writes to summary.md, the seconds to each error.  ``--docs`` copies the charts to docs/,
+``--fit`` writes radiosity/report/cost_table.json from the records, ``--against`` compares with the
+charts of another folder: counts and errors exactly, and the order of the frontiers.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from radiosity.report.cost_model import fit, write_table
 from radiosity.report.speed_accuracy import read_runs
+from radiosity.rivals import RIVALS, absent
 
+# The scene, the question, what answers are judged by where the rival is absent, and the rest.
 CHARTS = {
-    "shadows-tori": ["woo-tori", "--what", "shadows", "--limit", "4"],
-    "shadows-cornell": ["cornell-box", "--what", "shadows"],
-    "viewfactors-l-room": ["l-room", "--what", "viewfactors"],
-    "solve-cornell": ["cornell-box", "--what", "solve", "--points", "192", "--reference", "mitsuba"],
-    "solve-office": ["office", "--what", "solve", "--points", "96", "--reference", "mitsuba", "--limit", "4"],
-    "render-cornell": ["cornell-box", "--what", "render"],
-    "picture-cornell": ["cornell-box", "--what", "picture", "--width", "48", "--reference", "mitsuba"],
+    "shadows-tori": ["woo-tori", "--what", "shadows", "--reference", "exact"],
+    "viewfactors-l-room": ["l-room", "--what", "viewfactors", "--reference", "exact"],
+    "solve-cornell": ["cornell-box", "--what", "solve", "--points", "1000", "--reference", "mitsuba"],
+    "solve-office": ["office", "--what", "solve", "--points", "1000", "--reference", "mitsuba"],
+    "render-cornell": ["cornell-box", "--what", "render", "--reference", "mitsuba"],
+    "picture-cornell": ["cornell-box", "--what", "picture", "--reference", "mitsuba"],
 }
+LIMIT = "2"
+"""Seconds of a run after which finer settings of its technique are left out."""
 
 
-def run(folder: Path, only: str | None) -> None:
-    for name, arguments in CHARTS.items():
-        if only is None or only in name:
-            print(f"== {name}", flush=True)
-            command = [sys.executable, "-c", "from radiosity.cli import main; main()", "chart", *arguments]
-            subprocess.run([*command, "--repeats", "3", "-o", str(folder / name)], check=True)
+def run(folder: Path, name: str, against: Path | None) -> int:
+    arguments = list(CHARTS[name])
+    if arguments[-1] in RIVALS and absent(arguments[-1]) is not None:
+        print(f"{name}: {arguments[-1]} is left out: {absent(arguments[-1])}; the reference is a fine run of our own")
+        arguments[-1] = "converged"
+    if against is not None:
+        arguments += ["--compare", str(against / name)]
+    command = [sys.executable, "-c", "from radiosity.cli import main; main()", "chart", *arguments]
+    return subprocess.run([*command, "--limit", LIMIT, "-o", str(folder / name)], check=False).returncode
+
+
+def summary(folder: Path) -> str:
+    """Seconds to an error, a table in Markdown over all charts of a folder."""
+    rivals = list(RIVALS)
+    lines = ["| question | error | ours | by | " + " | ".join(rivals) + " |", "| --- " * (4 + len(rivals)) + "|"]
+    for name in CHARTS:
+        record = folder / name / "record.json"
+        if not record.exists():
+            continue
+        for row in json.loads(record.read_text())["results"].get("seconds to an error", []):
+            cells = [name, f"{row['error_%']:g} %", _seconds(row["ours"]), row["by"] or ""]
+            cells += [_seconds(row[rival]) if rival in row else "" for rival in rivals]
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}"
 
 
 def fitted(folder: Path) -> None:
@@ -46,12 +76,27 @@ def fitted(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", type=Path, default=Path("out/charts"))
-    parser.add_argument("--only")
+    parser.add_argument("--only", default="", help="charts whose name holds this")
+    parser.add_argument("--docs", action="store_true")
     parser.add_argument("--fit", action="store_true")
+    parser.add_argument("--against", type=Path)
     asked = parser.parse_args()
+    failed = []
+    for chart in CHARTS:
+        if asked.only in chart:
+            start = time.perf_counter()
+            print(f"== {chart}", flush=True)
+            if run(asked.o, chart, asked.against) != 0:
+                failed.append(chart)
+            print(f"== {chart}: {time.perf_counter() - start:.0f} s", flush=True)
+            if asked.docs:
+                shutil.copy(asked.o / chart / "chart.png", Path(f"docs/chart-{chart}.png"))
+    table = summary(asked.o)
+    (asked.o / "summary.md").write_text(table)
+    print(table)
     if asked.fit:
         fitted(asked.o)
-        sys.exit()
-    run(asked.o, asked.only)
+    if failed:
+        sys.exit(f"failed or not reproduced: {', '.join(failed)}")

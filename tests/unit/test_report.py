@@ -15,12 +15,15 @@ from matplotlib.figure import Figure
 from radiosity.report.metrics import at_error, frontier, relative_rms, slope
 from radiosity.report.page import html_page
 from radiosity.report.speed_accuracy import (
+    Run,
     auto_ratios,
+    compare,
     draw_chart,
     measure,
     points_of,
     read_runs,
     scene_digest,
+    seconds_to,
     write_runs,
 )
 from radiosity.report.techniques import Answer, Problem, Reference, Technique
@@ -136,6 +139,54 @@ def test_points_and_the_ratio_of_auto():
     points = points_of(runs)
     assert [(p.method, p.value, p.error, p.runs) for p in points][-1] == ("auto", 4.0, 0.5, 6)
     assert [ratio for _, ratio in auto_ratios(points)] == [pytest.approx(3.0)]
+
+
+def made(method, value, seconds, error, kind="ours", rays=0, repeat=0):
+    return Run(method, kind, "n", value, 0, repeat, seconds, seconds, 0.0, 0.0, error, 0.0, math.nan, rays=rays)
+
+
+def test_seconds_to_an_error_are_those_of_the_frontiers():
+    """Ours fall as 0.1 t^-1/2 and reach 1 %; the rival takes four times as long and ends at 3 %."""
+    runs = [made("a", t, t, 0.1 * t**-0.5) for t in (1.0, 10.0, 100.0)]
+    runs += [made("slow", t, 2.0 * t, 0.1 * t**-0.5) for t in (1.0, 100.0)]
+    runs += [made("r", t, 4.0 * t, 0.1 * t**-0.5, "rival") for t in (1.0, 100 / 9)]
+    rows = seconds_to(points_of(runs), (0.1, 0.03, 0.0100001, 0.001))
+    assert [row["ours"] for row in rows] == [
+        pytest.approx(1),
+        pytest.approx(100 / 9),
+        pytest.approx(100, rel=1e-4),
+        None,
+    ]
+    assert [row["r"] for row in rows][:2] == [pytest.approx(4), pytest.approx(400 / 9)]
+    assert rows[2]["r"] is None and rows[3]["by"] is None
+    assert rows[1]["by"] == "a (n 100)"
+
+
+def test_an_error_below_its_doubt_is_not_believed():
+    """A noisy reference is taken off: what is left may be 0, and then says no more than its doubt."""
+    run = replace(made("a", 1.0, 1.0, 0.0), error_standard_error=0.002)
+    assert points_of([run])[0].error == 0.002
+
+
+def test_compare_finds_changed_counts_and_swaps():
+    def record(factor=1.0, rays=64):
+        runs = [made("a", n, t, e, rays=rays, repeat=r) for n, t, e in ((1, 1.0, 0.2), (2, 4.0, 0.1)) for r in (0, 1)]
+        runs += [made("b", 1, 2.0 * factor * (1 + 0.1 * r), 0.15, repeat=r) for r in (0, 1)]
+        return [*runs, made("r", 1, 1.0, 0.9, "rival", rays=int(factor * 100))]
+
+    same = compare(record(), record())
+    assert (same.runs, same.frontier) == (7, 3) and not (same.counts or same.errors or same.swapped or same.ties)
+    # b moves from between a's two points to beyond both: of all pairs, that of a 2 and b 1 turns round.
+    moved = compare(record(), record(4.0))
+    assert len(moved.swapped) == 1 and "a 2" in moved.swapped[0] and "b 1" in moved.swapped[0] and not moved.ties
+    # The same move within the spread of b's runs is a tie.
+    wide = [replace(run, seconds=0.5 if run.method == "b" and run.repeat else run.seconds) for run in record(4.0)]
+    tied = compare(record(), [*wide, made("b", 1, 8.0, 0.15, repeat=2)])
+    assert not tied.swapped and len(tied.ties) == 1
+    changed = compare(record(), record(rays=65))
+    assert len(changed.counts) == 4 and "rays 64 -> 65" in changed.counts[0]
+    off = compare(record(), [replace(run, error=run.error * 1.001) for run in record()])
+    assert len(off.errors) == 6  # a rival's errors are its own
 
 
 def test_chart_draws_every_technique_and_zero_errors():
