@@ -135,8 +135,9 @@ class Mitsuba(Rival):
         import drjit as dr
 
         mi = self._mi
-        count = len(points) * samples
         sampler = mi.load_dict({"type": self.sampler, "sample_count": samples})
+        samples = sampler.sample_count()  # it may have rounded up
+        count = len(points) * samples
         if self.sampler != "independent":
             sampler.set_samples_per_wavefront(samples)  # a wave holds all strata of each of its points
         sampler.seed(seed % (1 << 32), count)
@@ -209,6 +210,7 @@ def _module(variant: str) -> Any:
 
     if mitsuba.variant() != variant:
         mitsuba.set_variant(variant)
+        mitsuba.set_log_level(mitsuba.LogLevel.Error)  # it warns of every number of samples that it rounds
     return mitsuba
 
 
