@@ -18,12 +18,17 @@ import shapely
 from numpy.typing import NDArray
 
 from workbench.errors import OptionError
+from workbench.geometry.contacts import contact_lines, cut_along
 from workbench.geometry.flat import Geometry
 from workbench.geometry.polygons import convex_pieces, fan_triangles, plane_basis, vector_area
 from workbench.scene.model import Scene, Surface
 
 TESSELLATED = 64
 """Faces from which a surface counts as tessellated, so that its small facets are clustered."""
+NEAR = 0.05
+"""Distance, as a share of an element's edge, within which polygons touch: elements are cut along the lines."""
+LEAST_TOUCHING = 0.2
+"""Extent, as a share of an element's edge, below which a polygon's contacts are not looked at."""
 COARSE_CLUSTERS = 12
 """Least number of cubes over a tessellated surface, however coarse the mesh."""
 
@@ -152,6 +157,22 @@ class _Part:
     elements: list[list[FloatArray]]
     patch_of: list[int]
     senders: list[list[FloatArray]]
+
+
+def _cut_at_contacts(part: _Part, normal: FloatArray, segments: FloatArray) -> _Part:
+    """The part with its elements cut where other polygons touch them.
+
+    Patches of several elements send as before; where each element is a patch, so is each new one.
+    """
+    elements: list[list[FloatArray]] = []
+    patch_of: list[int] = []
+    for element, patch in zip(part.elements, part.patch_of, strict=True):
+        cells = cut_along(element, normal, segments)
+        elements.extend(cells)
+        patch_of.extend([patch] * len(cells))
+    if len(part.senders) == len(part.elements):
+        return _Part(elements, list(range(len(elements))), elements)
+    return _Part(elements, patch_of, part.senders)
 
 
 def _steps(length: float, edge: float, split: int) -> int:
@@ -435,6 +456,8 @@ def build_mesh(
         edge = max_edge
     elif elements is not None:
         edge = _edge_for(scene, geometry, elements, split)
+    # One element a polygon is asked for as such; elements of a mesh end where something stands on them.
+    contacts = contact_lines(geometry, NEAR * edge, LEAST_TOUCHING * edge) if math.isfinite(edge) else {}
     edge = min(edge, 4.0 * geometry.size)
 
     rings: list[list[FloatArray]] = []
@@ -488,6 +511,8 @@ def build_mesh(
                 part = _mesh_quad(loops[0], edge, split)
             else:
                 part = _mesh_polygon(loops, pieces, edge, split)
+            if number + face in contacts:
+                part = _cut_at_contacts(part, geometry.polygon_normal[number + face], contacts[number + face])
             for sign in sides:
                 base = len(senders)
                 rings.extend([loop[::sign] for loop in element] for element in part.elements)
