@@ -112,7 +112,7 @@ def _shares(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def ray_shares(
-    pairs: IntArray, goals: FloatArray, seed: int, pieces, tracer: EmbreeAccelerator
+    pairs: IntArray, goals: FloatArray, seed: int, pieces, tracer: EmbreeAccelerator, most: int = MOST_RAYS
 ) -> tuple[FloatArray, FloatArray, int]:
     """Visible share of each pair of pieces by rays, its standard error, and the rays traced.
 
@@ -125,13 +125,15 @@ def ray_shares(
     pieces
         Corners, start, normal and area of the pieces.
     tracer : EmbreeAccelerator
+    most : int
+        Most rays of a pair.
     """
     sums = np.zeros((len(pairs), 3))
     counts = np.full(len(pairs), FIRST_RAYS, dtype=np.int64)
     begin = np.zeros(len(pairs), dtype=np.int64)
     traced = _trace(pairs, begin, counts, seed, pieces, tracer, sums)
     _, doubt = _shares(sums)
-    wanted = np.minimum((doubt / goals) ** 2 * FIRST_RAYS, MOST_RAYS)
+    wanted = np.minimum((doubt / goals) ** 2 * FIRST_RAYS, most)
     more = np.flatnonzero(wanted > 1.5 * FIRST_RAYS)
     if len(more):
         extra = np.ceil(wanted[more]).astype(np.int64) - FIRST_RAYS

@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
-from radiosity.form_factors import _pairs
-from radiosity.form_factors._ray_shares import ray_shares
+from radiosity.form_factors import _pairs, _stripes
+from radiosity.form_factors._ray_shares import MOST_RAYS, ray_shares
+from radiosity.form_factors._refine import cell_workspace
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
 from workbench.accel.embree import EmbreeAccelerator
 from workbench.culling.shaft import MAX_SHAFT_PLANES
@@ -48,6 +50,10 @@ LARGE = 600
 """Fewer rows than this are large polygons: longer candidate lists are cut, at more points."""
 COVERED = 0.01
 """Share of a row of a closed scene that must be missing to count as covered (the floor under a box)."""
+BLOCK_ROWS = 128
+"""Rows of a matrix that a thread takes at once."""
+REFINEMENTS, AIM = 3, 0.7
+"""Most rounds of refining, and the part of the wanted error that they aim at."""
 ROUNDS = 200
 """Most rounds of the scaling that closes rows."""
 DENSE_ENTRY, SPARSE_ENTRY = 12, 16
@@ -55,6 +61,7 @@ DENSE_ENTRY, SPARSE_ENTRY = 12, 16
 CLOSED_TO = 1e-10
 """Error of a row sum at which the scaling ends."""
 
+_CENTROID = (np.full((1, 3), 1.0 / 3.0), np.ones(1))
 _TRIANGLE_3 = (np.array([[4.0, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6.0, np.full(3, 1.0 / 3.0))
 _A, _B = 0.445948490915965, 0.091576213509771
 _TRIANGLE_6 = (
@@ -352,26 +359,44 @@ class _Care:
     error: float
     share_error: float
     floor: float
+    first: int
     levels: int
     limit: int
     reach: FloatArray
 
     @classmethod
-    def for_error(cls, error: float, count: int) -> _Care:
+    def for_error(cls, error: float, count: int, loose: bool = True) -> _Care:
         """Settings for an L1 error of the rows: half of it for open exchanges, half for visible shares."""
         relative = 0.5 * error
+        first = 0 if loose and error > 1e-2 and count >= LARGE else 1
         rules = (_pairs.POINT_RULE, 2.0), (_pairs.COARSE_RULE, 4.0), (_pairs.FINE_RULE, 5.6), (_pairs.LAMBERT_RULE, 5.6)
         return cls(
             error=relative,
             # Pairs seen in part carry about a tenth of a row.
             share_error=6.0 * error,
             floor=1.0 / max(count, 1),
-            # Mean error of a share by rules of 3, 12, 48, ... points a triangle: 2.5 %, 0.6 %, 0.2 %, ...
+            # Mean error of a share by rules of 1, 3, 12, 48, ... points a triangle: 5 %, 2.5 %, 0.6 %, 0.2 %, ...
             # Few and large polygons have more in their shadows: they get a level more.
-            levels=min(1 + sum(error < limit for limit in (1e-2, 3e-3, 4e-4, 5e-5)) + (count < LARGE), 5),
+            first=first,
+            levels=min(
+                2 - (first == 0) + sum(error < limit for limit in (1e-2, 3e-3, 4e-4, 5e-5)) + (count < LARGE), 6
+            ),
             limit=min(12 if error > 5e-3 else 32 if count >= LARGE else _pairs.MAX_CUT, _pairs.MAX_CUT),
             reach=np.array([(factor / relative) ** (1.0 / power) for factor, power in rules]),
         )
+
+
+class _Stripe(NamedTuple):
+    """What was found in a stripe: rows, exchange areas and errors of its pairs, and what it took."""
+
+    row: NDArray[np.int32]
+    column: NDArray[np.int32]
+    value: FloatArray
+    error: NDArray[np.float32]
+    bins: FloatArray
+    tally: NDArray[np.int64]
+    rays: int
+    refined: int
 
 
 class _Engine:
@@ -387,7 +412,11 @@ class _Engine:
         self.tracer: EmbreeAccelerator | None = None
         p, t, o = self.pieces, self.tree, self.occluders
         frame, flat, flow, fhigh = _occluder_frames(o)
-        levels = [_rule_points(p, _split_triangle(_TRIANGLE_3, k), _gauss_square(2, 2**k)) for k in range(care.levels)]
+        levels = [_rule_points(p, _CENTROID, _gauss_square(1, 1))]
+        levels += [
+            _rule_points(p, _split_triangle(_TRIANGLE_3, k), _gauss_square(2, 2**k))
+            for k in range(max(care.levels - 1, 1))
+        ]
         ends = np.cumsum([0] + [len(points) for _, points in levels])
         points = np.concatenate([points for _, points in levels])
         level_starts = np.stack([start + end for (start, _), end in zip(levels, ends[:-1], strict=True)])
@@ -400,7 +429,7 @@ class _Engine:
             o.corners, o.start, o.normal, o.offset, o.group, o.through, frame, flat, flow, fhigh,
             np.minimum.reduceat(o.corners, starts) if o.count else np.empty((0, 3)),
             np.maximum.reduceat(o.corners, starts) if o.count else np.empty((0, 3)),
-            o.slack, care.error, care.share_error, care.floor, care.levels, care.reach, care.limit,
+            o.slack, care.error, care.share_error, care.floor, care.first, care.levels, care.reach, care.limit,
         )  # fmt: skip
         self._corners = int(max(np.diff(p.start).max(), np.diff(o.start).max(initial=3), 8))
         self._idle: list[tuple[Any, ...]] = []
@@ -411,6 +440,7 @@ class _Engine:
         widest = int((self.tree.last - self.tree.first)[self.tree.stripes].max())
         return (
             *_pairs.pair_workspace(self._corners),
+            *cell_workspace(self.occluders.count),
             np.empty((MAX_SHAFT_PLANES, 4)),
             np.empty((16, 3)),
             np.empty(96 * (self.occluders.count + 1), dtype=np.int64),
@@ -419,8 +449,13 @@ class _Engine:
             np.zeros((widest, self.pieces.count)),
         )
 
-    def stripe(self, node: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray, NDArray[np.int64], int]:
-        """Pairs (i, j) of pieces that exchange, i < j, their exchange areas and errors; tally; rays."""
+    def stripe(
+        self, node: int, row_of: NDArray[np.int32], importance: FloatArray, threshold: float = math.inf
+    ) -> _Stripe:
+        """The pairs of a stripe's pieces with all that come after each.
+
+        Pairs whose error times the ``importance`` of both pieces is above ``threshold`` are refined.
+        """
         scratch = self._scratch()
         try:
             rows = int(self.tree.last[node] - self.tree.first[node])
@@ -429,45 +464,45 @@ class _Engine:
             while True:
                 flagged = np.empty((room, 2), dtype=np.int64)
                 tally = new_tally()
-                flags = _pairs.stripe(node, *self._nodes, *self._constant, *scratch[:-2], out, spread, flagged, tally)
+                flags, refined = _stripes.stripe(
+                    node, *self._nodes, *self._constant, importance, *scratch[:-2], out, spread, flagged, threshold,
+                    tally,
+                )  # fmt: skip
                 if flags <= room:
                     break
                 room = int(flags)
             traced = 0
             base = int(self.tree.first[node])
             if flags:
-                traced = self._by_rays(flagged[:flags], base, out, spread)
+                traced = self._by_rays(flagged[:flags], base, out, spread, importance, threshold)
             # A pair that no point saw may still exchange a little: its error stays.
-            count = _pairs.count_pairs(spread, rows)
-            i, j = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
-            value, error = np.empty(count), np.empty(count)
-            _pairs.take_pairs(out, spread, rows, base, i, j, value, error)
-            return i, j, value, error, tally, traced
+            count = _stripes.count_pairs(spread, rows)
+            r, c = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int32)
+            value, error = np.empty(count), np.empty(count, dtype=np.float32)
+            bins = np.zeros((_stripes.BINS, 2))
+            _stripes.take_pairs(out, spread, rows, base, row_of, importance, r, c, value, error, bins)
+            return _Stripe(r, c, value, error, bins, tally, traced, int(refined))
         finally:
             self._idle.append(scratch)
 
-    def _by_rays(self, pairs: IntArray, base: int, out: FloatArray, spread: FloatArray) -> int:
+    def _by_rays(
+        self, pairs: IntArray, base: int, out: FloatArray, spread: FloatArray, importance: FloatArray, threshold: float
+    ) -> int:
         assert self.tracer is not None
-        whole = out[pairs[:, 0] - base, pairs[:, 1]]
-        smaller = np.minimum(self.pieces.area[pairs[:, 0]], self.pieces.area[pairs[:, 1]])
+        i, j = pairs[:, 0], pairs[:, 1]
+        whole = out[i - base, j]
+        smaller = np.minimum(self.pieces.area[i], self.pieces.area[j])
         goals = self.care.share_error * (1.0 + self.care.floor * smaller / whole)
-        share, doubt, traced = ray_shares(pairs, goals, self.seed, self.pieces, self.tracer)
-        out[pairs[:, 0] - base, pairs[:, 1]] = whole * share
-        spread[pairs[:, 0] - base, pairs[:, 1]] = spread[pairs[:, 0] - base, pairs[:, 1]] * share + whole * doubt
+        goals = np.minimum(goals, threshold / (whole * (importance[i] + importance[j])))
+        most = MOST_RAYS if threshold == math.inf else 64 * MOST_RAYS
+        share, doubt, traced = ray_shares(pairs, goals, self.seed, self.pieces, self.tracer, most)
+        out[i - base, j] = whole * share
+        spread[i - base, j] = spread[i - base, j] * share + whole * doubt
         return traced
 
     def prepare_rays(self) -> None:
         """Build Embree's tree before threads need it."""
         self.tracer = EmbreeAccelerator(self.geometry)
-
-
-def _times_rows(matrix: Matrix, scale: FloatArray) -> Matrix:
-    """Each row of a matrix times a number, in place."""
-    if isinstance(matrix, np.ndarray):
-        matrix *= scale[:, None].astype(matrix.dtype)
-        return matrix
-    matrix.data *= np.repeat(scale, np.diff(matrix.indptr)).astype(matrix.dtype)
-    return matrix
 
 
 def close_rows(exchange: Matrix, wanted: FloatArray) -> FloatArray:
@@ -493,22 +528,28 @@ def close_rows(exchange: Matrix, wanted: FloatArray) -> FloatArray:
         sums = x * (exchange @ x)
         live = (sums > 0) & (wanted > 0)
         ratio = np.divide(wanted, sums, out=np.ones(len(wanted)), where=live)
-        if np.abs(ratio - 1.0).max(initial=0.0) < CLOSED_TO:
+        off = float(np.abs(ratio - 1.0).max(initial=0.0))
+        if off < CLOSED_TO:
             break
-        step = _newton_step(exchange, x, sums, np.where(live, wanted - sums, 0.0))
+        # A step leaves the square of what was off: to solve for it more closely would be wasted.
+        fraction = min(max(off, 0.1 * CLOSED_TO / off), 0.01)
+        step = _newton_step(exchange, x, sums, np.where(live, wanted - sums, 0.0), fraction)
         # Far from the goal a step could turn a sign: there the plain scaling goes on.
         x *= 1.0 + step if np.abs(step).max() < 0.3 else np.sqrt(ratio)
     return x
 
 
-def _newton_step(exchange: Matrix, x: FloatArray, sums: FloatArray, missing: FloatArray) -> FloatArray:
-    """Relative change d of x by Newton: ``(diag(sums) + X S X) d = missing``, by conjugate gradients."""
+def _newton_step(exchange: Matrix, x: FloatArray, sums: FloatArray, missing: FloatArray, fraction: float) -> FloatArray:
+    """Relative change d of x by Newton: ``(diag(sums) + X S X) d = missing``, by conjugate gradients.
+
+    They end where ``fraction`` of what is missing is left.
+    """
     diagonal = np.where(sums > 0, sums, 1.0)
     d = np.zeros_like(x)
     rest = missing.copy()
     along = rest / diagonal
     square = float(rest @ along)
-    goal = 1e-8 * square
+    goal = fraction * fraction * square
     for _ in range(50):
         if square <= goal:
             break
@@ -753,9 +794,9 @@ def view_factors(
         require_memory(needed, f"a matrix of {len(names)} x {len(names)} view factors", advice)
         engine.prepare_rays()
     with record.stage("exchange areas"):
-        exchange, spread = _all_exchanges(engine, row_of[pieces.owner], len(names), threads, record, progress)
+        exchange, spread = _all_exchanges(engine, row_of[pieces.owner], areas, threads, record, progress, error)
     with record.stage("close"):
-        found = _finished(scene, exchange, spread, areas, names, record)
+        found = _finished(scene, exchange, spread, areas, names, record, threads)
     record.results.update(rows=len(names), pieces=n, occluders=engine.occluders.count, sparse=found.sparse)
     return found
 
@@ -793,70 +834,151 @@ def exchange_areas(
         If the matrix would not fit in memory.
     """
     n = mesh.element_count
-    engine = _Engine(_Elements.of_mesh(mesh), geometry, _Care.for_error(error, n), seed)
+    engine = _Engine(_Elements.of_mesh(mesh), geometry, _Care.for_error(error, n, loose=False), seed)
     require_memory(3.0 * DENSE_ENTRY * n**2, f"a matrix of {n} x {n} form factors", "ask for fewer elements")
     engine.prepare_rays()
-    exchange, spread = _all_exchanges(engine, engine.pieces.owner, n, workers, record, progress)
+    exchange, spread = _all_exchanges(engine, engine.pieces.owner, mesh.element_area, workers, record, progress)
     whole = [part if isinstance(part, np.ndarray) else part.toarray() for part in (exchange, spread)]
     return whole[0], whole[1]
 
 
 def _all_exchanges(
-    engine: _Engine, row_of: NDArray[Any], rows: int, threads: int, record: RunRecord, progress: Progress | None
+    engine: _Engine,
+    row_of: NDArray[Any],
+    areas: FloatArray,
+    threads: int,
+    record: RunRecord,
+    progress: Progress | None,
+    error: float = math.inf,
 ) -> tuple[Matrix, Matrix]:
-    """Symmetric exchange areas between rows and their errors, dense or sparse, whichever is smaller."""
-    tree, n = engine.tree, engine.pieces.count
-    merges = rows < n
-    parts: list[tuple[Any, ...]] = []
-    pool = ThreadPoolExecutor(threads)
-    done = 0.0
+    """Symmetric exchange areas between rows and their errors, dense or sparse, whichever is smaller.
+
+    Where the stated error is above ``error``, the pairs that make it are refined.
+    """
+    tree, n, rows = engine.tree, engine.pieces.count, len(areas)
+    row_of = row_of.astype(np.int32)
+    importance = 1.0 / areas[row_of] / rows
+    found: dict[int, _Stripe] = {}
+
+    def run(stripes: list[int], threshold: float) -> None:
+        done = 0
+        each = pool.map(lambda node: engine.stripe(node, row_of, importance, threshold), stripes)
+        for node, stripe in zip(stripes, each, strict=True):
+            add_tally(record.counters, stripe.tally)
+            record.counters.add(rays=stripe.rays)
+            found[node] = _merged(stripe, rows) if rows < n else stripe
+            done += int((tree.last[node] - tree.first[node]) * (2 * n - tree.first[node] - tree.last[node]))
+            if progress is not None and threshold == math.inf:
+                progress(min(done / n**2, 1.0))
+
+    with _threads(threads) as pool:
+        run(tree.stripes.tolist(), math.inf)
+        for _ in range(REFINEMENTS):
+            stated = _stated(list(found.values()), areas)
+            if stated <= error:
+                break
+            bins = np.sum([stripe.bins for stripe in found.values()], axis=0)
+            threshold = _threshold(bins, AIM * error * float(bins[:, 1].sum()) / stated)
+            again = [node for node, stripe in found.items() if _above(stripe.bins, threshold)]
+            run(again, threshold)
+            record.results["refined_pairs"] = sum(stripe.refined for stripe in found.values())
+        parts = [found[node][:4] for node in tree.stripes.tolist()]
+        found.clear()
+        if rows == n:
+            return _symmetric(parts, rows, pool.map)
+    r, c, value, doubt = (np.concatenate([part[k] for part in parts]) for k in range(4))
+    parts.clear()
+    both = scipy.sparse.coo_array((value, (r, c)), shape=(rows, rows)).tocsr()
+    square = scipy.sparse.coo_array((doubt.astype(np.float64) ** 2, (r, c)), shape=(rows, rows)).tocsr()
+    # On the diagonal both directions are one: the sum of both is twice the half.
+    exchange = scipy.sparse.csr_array(both + both.T)
+    spread = scipy.sparse.csr_array((square + square.T).sqrt().astype(np.float32))
+    if SPARSE_ENTRY * exchange.nnz >= DENSE_ENTRY * rows**2:
+        return exchange.toarray(), spread.toarray()
+    for matrix in (exchange, spread):
+        matrix.sort_indices()
+    return exchange, spread
+
+
+def _merged(stripe: _Stripe, rows: int) -> _Stripe:
+    """What belongs to the same rows added up; errors as those of independent pairs."""
+    key = np.minimum(stripe.row, stripe.column) * np.int64(rows) + np.maximum(stripe.row, stripe.column)
+    key, place = np.unique(key, return_inverse=True)
+    place = place.ravel()
+    low, high = np.divmod(key, rows)
+    square = np.bincount(place, np.square(stripe.error, dtype=np.float64), len(key))
+    return stripe._replace(
+        row=low.astype(np.int32),
+        column=high.astype(np.int32),
+        value=np.bincount(place, stripe.value, len(key)).astype(np.float64),
+        error=np.sqrt(square).astype(np.float32),
+    )
+
+
+def _stated(stripes: list[_Stripe], areas: FloatArray) -> float:
+    """Mean over the rows of the sum of all errors."""
+    total = 0.0
+    for stripe in stripes:
+        total += float(stripe.error @ (1.0 / areas[stripe.row] + 1.0 / areas[stripe.column]))
+    return total / len(areas)
+
+
+def _threshold(bins: FloatArray, wanted: float) -> float:
+    """The error at which pairs must be cut off for the sum of all to come to ``wanted``."""
+    # From the smallest up: what lies below stays, what lies above would be cut to the threshold.
+    below = np.concatenate([[0.0], np.cumsum(bins[:, 1])])
+    above = np.concatenate([np.cumsum(bins[::-1, 0])[::-1], [0.0]])
+    for b in range(len(bins)):
+        edge = 2.0 ** (b + _stripes.FIRST_BIN)
+        if below[b + 1] + above[b + 1] * edge > wanted:
+            return max((wanted - below[b]) / max(above[b], 1.0), 0.25 * edge)
+    return math.inf
+
+
+def _above(bins: FloatArray, threshold: float) -> bool:
+    """Whether a stripe has an error above the threshold."""
+    lowest = math.frexp(threshold)[1] - _stripes.FIRST_BIN
+    return bool(bins[max(lowest, 0) :, 0].any())
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[ThreadPoolExecutor]:
+    """A pool whose waiting work is dropped when something stops it."""
+    pool = ThreadPoolExecutor(count)
     try:
-        stripes = tree.stripes.tolist()
-        for node, (i, j, value, error, tally, traced) in zip(stripes, pool.map(engine.stripe, stripes), strict=True):
-            add_tally(record.counters, tally)
-            record.counters.add(rays=traced)
-            low, high = np.minimum(row_of[i], row_of[j]), np.maximum(row_of[i], row_of[j])
-            if merges:
-                # Several pieces a row: add up what belongs together at once.
-                key, place = np.unique(low * rows + high, return_inverse=True)
-                place = place.ravel()
-                low, high = np.divmod(key, rows)
-                value = np.bincount(place, value, len(key)).astype(np.float64)
-                error = np.sqrt(np.bincount(place, error * error, len(key)))
-            parts.append((low.astype(np.int32), high.astype(np.int32), value, error.astype(np.float32)))
-            if progress is not None:
-                first, last = tree.first[node], tree.last[node]
-                done += float((last - first) * (2 * n - first - last)) / n**2
-                progress(min(done, 1.0))
+        yield pool
     finally:
         pool.shutdown(cancel_futures=True)
-    r, c, value, error = (np.concatenate([part[k] for part in parts]) for k in range(4))
-    parts.clear()
-    if merges:
-        both = scipy.sparse.coo_array((value, (r, c)), shape=(rows, rows)).tocsr()
-        doubt = scipy.sparse.coo_array((error.astype(np.float64) ** 2, (r, c)), shape=(rows, rows)).tocsr()
-        # On the diagonal both directions are one: the sum of both is twice the half.
-        exchange = scipy.sparse.csr_array(both + both.T)
-        spread = scipy.sparse.csr_array((doubt + doubt.T).sqrt())
-        if SPARSE_ENTRY * exchange.nnz >= DENSE_ENTRY * rows**2:
-            return exchange.toarray(), spread.toarray()
-        return exchange, spread
-    if SPARSE_ENTRY * 2 * len(value) >= DENSE_ENTRY * rows**2:
+
+
+def _blocks(rows: int) -> list[tuple[int, int]]:
+    return [(first, min(first + BLOCK_ROWS, rows)) for first in range(0, rows, BLOCK_ROWS)]
+
+
+def _symmetric(parts: list[tuple[Any, ...]], rows: int, each: Callable[..., Any]) -> tuple[Matrix, Matrix]:
+    """The whole matrices of distinct pairs (r, c, value, error), which are given up on the way."""
+    count = 2 * sum(len(part[0]) for part in parts)
+    if SPARSE_ENTRY * count >= DENSE_ENTRY * rows**2:
         dense, dense_error = np.zeros((rows, rows)), np.zeros((rows, rows), dtype=np.float32)
-        _scatter(r, c, value, error, dense, dense_error)
+        while parts:
+            r, c, value, error = parts.pop()
+            _scatter(r, c, value, error, dense, dense_error)
         return dense, dense_error
-    start = np.zeros(rows + 1, dtype=np.int64)
-    start[1:] = np.cumsum(np.bincount(r, minlength=rows) + np.bincount(c, minlength=rows))
-    column = np.empty(2 * len(value), dtype=np.int32)
-    data, errors = np.empty(len(column)), np.empty(len(column), dtype=np.float32)
-    _symmetric_rows(r, c, value, error, start, column, data, errors)
-    if start[-1] < 2**31:
-        start = start.astype(np.int32)
-    exchange = scipy.sparse.csr_array((data, column, start), shape=(rows, rows))
-    exchange.has_sorted_indices = True
-    spread = scipy.sparse.csr_array((errors, column, start), shape=(rows, rows))
-    spread.has_sorted_indices = True
-    return exchange, spread
+    start = np.zeros(rows + 1, dtype=np.int32 if count < 2**31 else np.int64)
+    for part in parts:
+        _count_rows(part[0], part[1], start)
+    np.cumsum(start, out=start)
+    column = np.empty(count, dtype=np.int32)
+    data, errors = np.empty(count), np.empty(count, dtype=np.float32)
+    place = start[:-1].copy()
+    while parts:
+        r, c, value, error = parts.pop()
+        _place_pairs(r, c, value, error, place, column, data, errors)
+    list(each(lambda block: _sort_rows(block[0], block[1], start, column, data, errors), _blocks(rows)))
+    made = [scipy.sparse.csr_array((part, column, start), shape=(rows, rows)) for part in (data, errors)]
+    for matrix in made:
+        matrix.has_sorted_indices = True
+    return made[0], made[1]
 
 
 @njit(nogil=True, cache=True)
@@ -870,103 +992,116 @@ def _scatter(r, c, value, error, dense, dense_error):
 
 
 @njit(nogil=True, cache=True)
-def _symmetric_rows(r, c, value, error, start, column, data, errors):
-    """Fill the rows of a symmetric CSR matrix, columns ascending, from distinct pairs (r, c), by counting."""
-    rows = start.shape[0] - 1
-    count = 2 * r.shape[0]
-    # All entries by column first; then, in that order, each to the next place of its row.
-    place = start[:-1].copy()
-    order = np.empty(count, dtype=np.int64)
+def _count_rows(r, c, start):
+    """Add the entries of each row, both ways, to the place after it."""
     for k in range(r.shape[0]):
-        order[place[r[k]]] = 2 * k
-        place[r[k]] += 1
-        order[place[c[k]]] = 2 * k + 1
-        place[c[k]] += 1
-    for i in range(rows):
-        place[i] = start[i]
-    for col in range(rows):
-        for p in range(start[col], start[col + 1]):
-            k = order[p] >> 1
-            # Entry 2 k stands in column r and row c, its mirror image the other way round.
-            row = c[k] if order[p] & 1 == 0 else r[k]
-            q = place[row]
-            column[q], data[q], errors[q] = col, value[k], error[k]
-            place[row] = q + 1
+        start[r[k] + 1] += 1
+        start[c[k] + 1] += 1
+
+
+@njit(nogil=True, cache=True)
+def _place_pairs(r, c, value, error, place, column, data, errors):
+    """Put each pair to the next place of both its rows."""
+    for k in range(r.shape[0]):
+        i, j = r[k], c[k]
+        p, q = place[i], place[j]
+        column[p], data[p], errors[p] = j, value[k], error[k]
+        column[q], data[q], errors[q] = i, value[k], error[k]
+        place[i], place[j] = p + 1, q + 1
+
+
+@njit(nogil=True, cache=True)
+def _sort_rows(first, last, start, column, data, errors):
+    """Put the entries of rows ``first..last`` in the order of their columns: through a whole row, no comparison."""
+    rows = start.shape[0] - 1
+    there = np.zeros(rows, dtype=np.bool_)
+    values, doubts = np.empty(rows), np.empty(rows, dtype=np.float32)
+    for i in range(first, last):
+        for k in range(start[i], start[i + 1]):
+            j = column[k]
+            there[j] = True
+            values[j], doubts[j] = data[k], errors[k]
+        k = start[i]
+        for j in range(rows):
+            if there[j]:
+                there[j] = False
+                column[k], data[k], errors[k] = j, values[j], doubts[j]
+                k += 1
 
 
 def _finished(
-    scene: Scene, exchange: Matrix, spread: Matrix, areas: FloatArray, names: list[str], record: RunRecord
+    scene: Scene,
+    exchange: Matrix,
+    spread: Matrix,
+    areas: FloatArray,
+    names: list[str],
+    record: RunRecord,
+    threads: int,
 ) -> ViewFactors:
     """Close the rows of an enclosure, divide by the areas, and say how good it is."""
-    sums = np.asarray(exchange.sum(axis=1)).ravel() / areas
-    stated = np.asarray(spread.sum(axis=1)).ravel() / areas
-    correction = 0.0
-    if scene.closed:
-        covered = 1.0 - sums > np.maximum(2.0 * np.maximum(stated, record.settings["error"]), COVERED)
-        x = close_rows(exchange, np.where(covered, sums * areas, areas))
-        if isinstance(exchange, np.ndarray):
-            change = 0.0
-            for first in range(0, len(areas), 256):
-                rows = slice(first, first + 256)
-                scale = x[rows, None] * x[None, :] - 1.0
-                moved = np.abs(scale * exchange[rows])
-                change = max(change, float((moved / areas[rows, None]).max()))
-                spread[rows] = np.hypot(spread[rows], moved)
-                exchange[rows] *= scale + 1.0
-            correction = change
-        else:
-            correction = _scale_rows(exchange.indptr, exchange.indices, exchange.data, spread.data, x, areas)
-        record.results["covered_rows"] = int(covered.sum())
-    largest = float(exchange.max()) if len(areas) else 0.0
-    matrix = _times_rows(exchange, 1.0 / areas)
-    errors = _times_rows(spread, 1.0 / areas)
-    back = _asymmetry(matrix, areas) / max(largest, 1e-300)
-    closed_sums = np.asarray(matrix.sum(axis=1)).ravel()
+    n = len(areas)
+    if isinstance(exchange, np.ndarray):
+        start, column = np.arange(n + 1, dtype=np.int64) * n, np.empty(0, dtype=np.int32)
+        data, errors = exchange.ravel(), spread.ravel()
+    else:
+        start, column, data, errors = exchange.indptr, exchange.indices, exchange.data, spread.data
+    sums, stated, doubt, closed_sums = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    worst = np.zeros((n, 3))
+    x = np.ones(n)
+    with _threads(threads) as pool:
+
+        def each(work: Callable[[int, int], None]) -> None:
+            list(pool.map(lambda block: work(*block), _blocks(n)))
+
+        each(lambda first, last: _row_sums(first, last, start, data, errors, areas, sums, stated, doubt))
+        record.errors["stated_row_error_as_found"] = float(stated.mean())
+        if scene.closed:
+            covered = 1.0 - sums > np.maximum(4.0 * doubt, max(0.5 * record.settings["error"], COVERED))
+            x = close_rows(exchange, np.where(covered, sums * areas, areas))
+            record.results["covered_rows"] = int(covered.sum())
+        each(lambda first, last: _scale_rows(first, last, start, column, data, errors, x, areas, worst))
+        each(lambda first, last: _row_sums(first, last, start, data, errors, np.ones(n), closed_sums, stated, doubt))
+    correction, back, largest = worst.max(axis=0, initial=0.0).tolist()
+    back /= max(largest, 1e-300)
     record.errors.update(
         row_sum_as_found={"min": float(sums.min()), "mean": float(sums.mean()), "max": float(sums.max())},
         row_sum={"min": float(closed_sums.min()), "mean": float(closed_sums.mean()), "max": float(closed_sums.max())},
         closure_correction=correction,
         reciprocity=back,
-        stated_row_error=float(np.asarray(errors.sum(axis=1)).mean()),
+        stated_row_error=float(stated.mean()),
     )
-    return ViewFactors(matrix, errors, areas, names, sums, correction, back, record)
-
-
-def _asymmetry(matrix: Matrix, areas: FloatArray) -> float:
-    """Largest |A_i F_ij - A_j F_ji|."""
-    if isinstance(matrix, np.ndarray):
-        worst = 0.0
-        for first in range(0, len(areas), 256):
-            rows = slice(first, first + 256)
-            worst = max(
-                worst, float(np.abs(areas[rows, None] * matrix[rows] - (areas[:, None] * matrix[:, rows]).T).max())
-            )
-        return worst
-    return float(_worst_pair(matrix.indptr, matrix.indices, matrix.data, areas))
+    return ViewFactors(exchange, spread, areas, names, sums, correction, back, record)
 
 
 @njit(nogil=True, cache=True)
-def _scale_rows(indptr, indices, data, errors, x, areas):
-    """Scale a symmetric CSR matrix by x on both sides, and its errors with it; largest change over its row's area."""
-    largest = 0.0
-    for i in range(areas.shape[0]):
-        for k in range(indptr[i], indptr[i + 1]):
-            moved = (x[i] * x[indices[k]] - 1.0) * data[k]
-            largest = max(largest, abs(moved) / areas[i])
-            data[k] += moved
-            errors[k] = math.sqrt(errors[k] * errors[k] + moved * moved)
-    return largest
+def _row_sums(first, last, start, data, errors, areas, sums, stated, doubt):
+    """Sums of the rows ``first..last`` over their areas, of their errors, and of the squares of those (its root)."""
+    for i in range(first, last):
+        total = linear = square = 0.0
+        for k in range(start[i], start[i + 1]):
+            total += data[k]
+            linear += errors[k]
+            square += errors[k] * errors[k]
+        sums[i], stated[i], doubt[i] = total / areas[i], linear / areas[i], math.sqrt(square) / areas[i]
 
 
 @njit(nogil=True, cache=True)
-def _worst_pair(indptr, indices, data, areas):
-    """Largest |A_i F_ij - A_j F_ji| of a CSR matrix with a symmetric pattern and ascending columns."""
-    place = indptr[:-1].copy()
-    worst = 0.0
-    for i in range(areas.shape[0]):
-        for k in range(indptr[i], indptr[i + 1]):
-            # Row i is met by row j's entries in ascending order of i.
-            j = indices[k]
-            worst = max(worst, abs(areas[i] * data[k] - areas[j] * data[place[j]]))
-            place[j] += 1
-    return worst
+def _scale_rows(first, last, start, column, data, errors, x, areas, worst):
+    """Make exchange areas form factors: times x on both sides, over the area; their errors with them.
+
+    ``worst`` (n, 3): largest change of a form factor, |A_i F_ij - A_j F_ji| and exchange area of each row.
+    """
+    whole = column.shape[0] == 0
+    for i in range(first, last):
+        inverse = 1.0 / areas[i]
+        change = back = largest = 0.0
+        for k in range(start[i], start[i + 1]):
+            j = k - start[i] if whole else column[k]
+            moved = (x[i] * x[j] - 1.0) * data[k]
+            value = data[k] + moved
+            change = max(change, abs(moved) * inverse)
+            back = max(back, abs(areas[i] * (value * inverse) - areas[j] * (value * (1.0 / areas[j]))))
+            largest = max(largest, value)
+            data[k] = value * inverse
+            errors[k] = math.sqrt(errors[k] * errors[k] + moved * moved) * inverse
+        worst[i, 0], worst[i, 1], worst[i, 2] = change, back, largest

@@ -55,11 +55,10 @@ def exchanges(scene, error=2e-2):
     engine = _Engine(elements, geometry, _Care.for_error(error, elements.element_count), 0)
     engine.prepare_rays()
     found = {}
+    owner = engine.pieces.owner.astype(np.int32)
     for node in engine.tree.stripes.tolist():
-        i, j, value, doubt, _, _ = engine.stripe(node)
-        owner = engine.pieces.owner
-        entries = zip(owner[i], owner[j], value, doubt, strict=True)
-        found |= {(min(a, b), max(a, b)): (v, e) for a, b, v, e in entries}
+        i, j, value, doubt, *_ = engine.stripe(node, owner, np.ones(engine.pieces.count))
+        found |= {(min(a, b), max(a, b)): (v, e) for a, b, v, e in zip(i, j, value, doubt, strict=True)}
     return found
 
 

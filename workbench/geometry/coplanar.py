@@ -95,10 +95,11 @@ def _joined(rings: list[FloatArray], normal: FloatArray, size: float) -> list[Fl
     """Convex pieces of the union of convex rings in one plane; ``None`` if there is nothing to gain."""
     u, v = plane_basis(normal)
     origin = rings[0][0]
-    flat = [np.column_stack([(ring - origin) @ u, (ring - origin) @ v]) for ring in rings]
-    parts = [shapely.Polygon(ring) for ring in flat]
+    off = np.concatenate(rings) - origin
+    which = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    parts = shapely.polygons(shapely.linearrings(np.column_stack([off @ u, off @ v]), indices=which))
     # Neighbours mostly share whole edges: their union is found by dropping those, which overlaps make invalid.
-    area = sum(part.area for part in parts)
+    area = shapely.area(parts).sum()
     try:
         union = shapely.coverage_union_all(parts)
         joined = union.is_valid and abs(union.area - area) <= 1e-9 * area

@@ -1,0 +1,338 @@
+"""One pair of convex pieces to a wanted error, as kernels: both ends are halved where the pair's error is made.
+
+A cell is a part of each end.  Occluders that no longer come between its parts are dropped, so that most cells
+are soon clear (a closed form) or hidden; of the rest the part that is seen is cut exactly at the points of a
+rule, and halved until the halves agree with the whole.  Where the occluders are too many to cut by, the larger
+end is halved first: each half has fewer before it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from radiosity.form_factors._contour import contour_integral_in
+from radiosity.form_factors._links import _cell_points
+from radiosity.form_factors._pairs import _PLAIN, CLEARS, HIDES, _heights, crossings, seen_share, verdict
+from radiosity.form_factors.analytic import _clip_pair
+from workbench.culling.tally import CLOSED, COMPLEX, DARK, SHAFT_CULL, SHAFT_TEST
+from workbench.geometry.lambert import lambert_piece
+
+ROWS = 128
+"""Most cells that wait to be halved."""
+MOST_CELLS = 5_000
+"""Cells of a pair after which what is left counts as doubt."""
+SHORT = 24
+"""Candidates of a cell that are cut at once; of a longer list the larger end is halved first."""
+
+UNKNOWN, ROUGH, EXACT = -1, 0, 1
+
+
+def cell_workspace(occluders):
+    """Scratch of one thread: cells' corners (eight rows each), numbers, candidates, and their values."""
+    return (
+        np.empty((8 * ROWS, 3)),
+        np.empty((ROWS, 5), dtype=np.int64),
+        np.empty((ROWS, 4)),
+        np.empty(32 * (occluders + 1) + 4096, dtype=np.int64),
+        np.empty((4, 4)),
+    )
+
+
+@njit(**_PLAIN)
+def _halve(cells, source, size, first, second):
+    """Halve the polygon of three or four corners at row ``source``, to the rows ``first`` and ``second``.
+
+    Returns the number of corners of both halves.
+    """
+    if size == 3:
+        longest, turn = -1.0, 0
+        for k in range(3):
+            a, b = source + k, source + (k + 1) % 3
+            x, y, z = cells[b, 0] - cells[a, 0], cells[b, 1] - cells[a, 1], cells[b, 2] - cells[a, 2]
+            square = x * x + y * y + z * z
+            if square > longest:
+                longest, turn = square, k
+        a, b, c = source + turn, source + (turn + 1) % 3, source + (turn + 2) % 3
+        for axis in range(3):
+            p, q, r = cells[a, axis], cells[b, axis], cells[c, axis]
+            m = 0.5 * (p + q)
+            cells[first, axis], cells[first + 1, axis], cells[first + 2, axis] = p, m, r
+            cells[second, axis], cells[second + 1, axis], cells[second + 2, axis] = m, q, r
+        return 3
+    along = across = 0.0
+    for axis in range(3):
+        p, q, r, s = cells[source, axis], cells[source + 1, axis], cells[source + 2, axis], cells[source + 3, axis]
+        along += (q + r - p - s) ** 2
+        across += (r + s - p - q) ** 2
+    for axis in range(3):
+        p, q, r, s = cells[source, axis], cells[source + 1, axis], cells[source + 2, axis], cells[source + 3, axis]
+        if along >= across:
+            m, n = 0.5 * (p + q), 0.5 * (r + s)
+            cells[first, axis], cells[first + 1, axis], cells[first + 2, axis], cells[first + 3, axis] = p, m, n, s
+            cells[second, axis], cells[second + 1, axis], cells[second + 2, axis], cells[second + 3, axis] = m, q, r, n
+        else:
+            m, n = 0.5 * (q + r), 0.5 * (s + p)
+            cells[first, axis], cells[first + 1, axis], cells[first + 2, axis], cells[first + 3, axis] = p, q, m, n
+            cells[second, axis], cells[second + 1, axis], cells[second + 2, axis], cells[second + 3, axis] = n, m, r, s
+    return 4
+
+
+@njit(**_PLAIN)
+def _ball(cells, source, size):
+    """Centre of a cell's end and its radius about it."""
+    x = y = z = square = 0.0
+    for k in range(source, source + size):
+        x, y, z = x + cells[k, 0] / size, y + cells[k, 1] / size, z + cells[k, 2] / size
+    for k in range(source, source + size):
+        square = max(square, (cells[k, 0] - x) ** 2 + (cells[k, 1] - y) ** 2 + (cells[k, 2] - z) ** 2)
+    return x, y, z, math.sqrt(square)
+
+
+@njit(**_PLAIN)
+def _between(
+    cells, row, numbers, arena, begin, many, free, kc, ks, kn, kd, through, frame, flat, flow, fhigh, slack, points,
+    tally,
+):  # fmt: skip
+    """Candidates of ``arena[begin:begin + many]`` that come between the ends of a cell, put at ``free``.
+
+    Returns their number, -1 if one hides all.
+    """
+    s0, t0 = 8 * row, 8 * row + 4
+    s1, t1 = s0 + numbers[row, 0], t0 + numbers[row, 1]
+    used = 0
+    for c in range(begin, begin + many):
+        k = arena[c]
+        tally[SHAFT_TEST] += 1
+        ka, kb = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], cells, s0, s1)
+        la, lb = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], cells, t0, t1)
+        if (ka >= -slack and la >= -slack) or (kb <= slack and lb <= slack):
+            tally[SHAFT_CULL] += 1
+            continue
+        crossed, separates = crossings(
+            cells, s0, s1, cells, t0, t1, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], frame[k, 0], frame[k, 1], frame[k, 2],
+            frame[k, 3], frame[k, 4], frame[k, 5], frame[k, 6], frame[k, 7], frame[k, 8], slack, points,
+        )  # fmt: skip
+        what = verdict(points, crossed, separates, flat, ks[k], ks[k + 1], flow, fhigh, k, slack)
+        if what == CLEARS:
+            tally[SHAFT_CULL] += 1
+            continue
+        if what == HIDES and through[k] == 0.0:
+            return -1
+        arena[free + used] = k
+        used += 1
+    return used
+
+
+@njit(**_PLAIN)
+def _cell_value(
+    row, allowed, ns, nt, cells, numbers, arena, rule, kc, ks, kn, kd, through, fragments, sizes, weights, contour,
+    tally,
+):  # fmt: skip
+    """What the ends of a cell exchange past its candidates, the doubt of that, and how it was found."""
+    s0, t0 = 8 * row, 8 * row + 4
+    size_s, size_t = numbers[row, 0], numbers[row, 1]
+    begin, many = numbers[row, 2], numbers[row, 3]
+    if many > SHORT:
+        return 0.0, 0.0, UNKNOWN
+    corners = _cell_points(cells[s0 : s0 + 4], size_s == 4, rule)
+    total = 0.0
+    if many == 0:
+        tally[CLOSED] += 1
+        sx, sy, sz, sr = _ball(cells, s0, size_s)
+        tx, ty, tz, tr = _ball(cells, t0, size_t)
+        gap = math.sqrt((tx - sx) ** 2 + (ty - sy) ** 2 + (tz - sz) ** 2) - tr
+        if gap > 4.0 * sr:
+            for p in range(corners):
+                total += rule[p, 3] * max(
+                    lambert_piece(rule[p, 0], rule[p, 1], rule[p, 2], ns[0], ns[1], ns[2], cells, t0, t0 + size_t), 0.0
+                )
+            # The rule's error falls with the fourth power, or the third on triangles.
+            doubt = 0.1 * total * (sr / gap) ** size_s
+            if doubt <= 0.1 * allowed:
+                return total, doubt, EXACT
+        value, rounding = contour_integral_in(
+            cells[s0 : s0 + size_s], size_s, cells[t0 : t0 + size_t], size_t, 0.1 * allowed, contour
+        )
+        return value, rounding + 0.1 * allowed, EXACT
+    tally[COMPLEX] += 1
+    d = nt[0] * cells[t0, 0] + nt[1] * cells[t0, 1] + nt[2] * cells[t0, 2]
+    for p in range(corners):
+        if nt[0] * rule[p, 0] + nt[1] * rule[p, 1] + nt[2] * rule[p, 2] <= d:
+            continue
+        share = seen_share(
+            rule[p, 0], rule[p, 1], rule[p, 2], ns[0], ns[1], ns[2], cells, t0, t0 + size_t, kc, ks, kn, kd, through,
+            arena[begin : begin + many], many, fragments, sizes, weights, tally,
+        )  # fmt: skip
+        if share < 0.0:
+            return 0.0, 0.0, UNKNOWN
+        total += rule[p, 3] * share
+    return total, 0.0, ROUGH
+
+
+@njit(**_PLAIN)
+def _move(cells, numbers, values, source, target):
+    for k in range(8):
+        for axis in range(3):
+            cells[8 * target + k, axis] = cells[8 * source + k, axis]
+    for k in range(numbers.shape[1]):
+        numbers[target, k] = numbers[source, k]
+    for k in range(values.shape[1]):
+        values[target, k] = values[source, k]
+
+
+@njit(**_PLAIN)
+def _fan(ring, count, part, ox, oy, oz, cells, target):
+    """Part of a convex ring, whole if it has three or four corners, else a triangle of its fan; its corners."""
+    if count <= 4:
+        for k in range(count):
+            cells[target + k, 0], cells[target + k, 1], cells[target + k, 2] = (
+                ring[k, 0] + ox, ring[k, 1] + oy, ring[k, 2] + oz,
+            )  # fmt: skip
+        return count
+    for k in range(3):
+        c = 0 if k == 0 else part + k
+        cells[target + k, 0], cells[target + k, 1], cells[target + k, 2] = (
+            ring[c, 0] + ox, ring[c, 1] + oy, ring[c, 2] + oz,
+        )  # fmt: skip
+    return 3
+
+
+@njit(**_PLAIN)
+def refined_exchange(
+    i, j, begin, many, given, tolerance, corners, start, normal, radius, group, kc, ks, kn, kd, kg, through, frame,
+    flat, flow, fhigh, slack, fragments, sizes, weights, points, pair, contour, cells, numbers, values, arena, rule,
+    tally,
+):  # fmt: skip
+    """Exchange area of two pieces behind the occluders ``given[begin:begin + many]`` and the estimate of its error.
+
+    The third value tells whether what was found is all of it; if not, the candidates were too many.
+    """
+    m, k = _clip_pair(corners, start[i], start[i + 1], normal[i], corners, start[j], start[j + 1], normal[j], pair)
+    if m <= 0 or k <= 0:
+        return 0.0, 0.0, True
+    ox, oy, oz = corners[start[j], 0], corners[start[j], 1], corners[start[j], 2]
+    swapped = radius[j] < radius[i]
+    s, t = (j, i) if swapped else (i, j)
+    ring_s, ring_t = (3, 2) if swapped else (2, 3)
+    count_s, count_t = (k, m) if swapped else (m, k)
+    ns, nt = normal[s], normal[t]
+    root = 0
+    for c in range(begin, begin + many):
+        if kg[given[c]] == group[i] or kg[given[c]] == group[j]:
+            continue
+        if root == arena.shape[0]:
+            return 0.0, 0.0, False
+        arena[root] = given[c]
+        root += 1
+    fans_s = 1 if count_s <= 4 else count_s - 2
+    fans_t = 1 if count_t <= 4 else count_t - 2
+    share = tolerance / math.sqrt(fans_s * fans_t)
+    total = doubt = 0.0
+    made = 0
+    for part in range(fans_s * fans_t):
+        numbers[0, 0] = _fan(pair[ring_s], count_s, part // fans_t, ox, oy, oz, cells, 0)
+        numbers[0, 1] = _fan(pair[ring_t], count_t, part % fans_t, ox, oy, oz, cells, 4)
+        # Row -> its candidates (first and number); value, share of the error allowed, error of what it came from.
+        numbers[0, 2], numbers[0, 3], numbers[0, 4] = 0, root, UNKNOWN
+        values[0, 0], values[0, 1], values[0, 2] = 0.0, share, math.inf
+        if 2 * root > arena.shape[0]:
+            return 0.0, 0.0, False
+        left = _between(
+            cells, 0, numbers, arena, 0, root, root, kc, ks, kn, kd, through, frame, flat, flow, fhigh, slack, points,
+            tally,
+        )  # fmt: skip
+        if left < 0:
+            tally[DARK] += 1
+            continue
+        numbers[0, 2], numbers[0, 3] = root, left
+        value, off, state = _cell_value(
+            0, share, ns, nt, cells, numbers, arena, rule, kc, ks, kn, kd, through, fragments, sizes, weights,
+            contour, tally,
+        )  # fmt: skip
+        if state == EXACT:
+            total, doubt = total + value, doubt + off
+            continue
+        values[0, 0], numbers[0, 4] = value, state
+        top = 0
+        while top >= 0:
+            made += 1
+            if made > MOST_CELLS or top + 3 > ROWS:
+                # No more: what waits counts as it is.
+                for row in range(top + 1):
+                    if numbers[row, 4] == UNKNOWN:
+                        return total, doubt, False
+                    total += values[row, 0]
+                    doubt += min(values[row, 2], values[row, 0])
+                return total, doubt, True
+            size_s, size_t = numbers[top, 0], numbers[top, 1]
+            s0, t0 = 8 * top, 8 * top + 4
+            of_target = False
+            if numbers[top, 4] == UNKNOWN:
+                _, _, _, rs = _ball(cells, s0, size_s)
+                _, _, _, rt = _ball(cells, t0, size_t)
+                of_target = rt > rs
+            free = numbers[top, 2] + numbers[top, 3]
+            if free + 2 * numbers[top, 3] > arena.shape[0]:
+                return total, doubt, False
+            for half in range(2):
+                row = top + 1 + half
+                for c in range(8):
+                    for axis in range(3):
+                        cells[8 * row + c, axis] = cells[s0 + c, axis]
+                numbers[row, 0], numbers[row, 1] = size_s, size_t
+            shift = 4 if of_target else 0
+            _halve(cells, s0 + shift, size_t if of_target else size_s, s0 + 8 + shift, s0 + 16 + shift)
+            allowed = values[top, 1] * 0.7071067811865476
+            both = 0.0
+            rough = 0
+            unknown = numbers[top, 4] == UNKNOWN
+            for half in range(2):
+                row = top + 1 + half
+                left = _between(
+                    cells, row, numbers, arena, numbers[top, 2], numbers[top, 3], free, kc, ks, kn, kd, through, frame,
+                    flat, flow, fhigh, slack, points, tally,
+                )  # fmt: skip
+                if left < 0:
+                    tally[DARK] += 1
+                    numbers[row, 4], values[row, 0] = EXACT, 0.0
+                    continue
+                numbers[row, 2], numbers[row, 3] = free, left
+                value, off, state = _cell_value(
+                    row, allowed, ns, nt, cells, numbers, arena, rule, kc, ks, kn, kd, through, fragments, sizes,
+                    weights, contour, tally,
+                )  # fmt: skip
+                free += left
+                numbers[row, 4], values[row, 0] = state, value
+                if state == EXACT:
+                    doubt += off
+                unknown = unknown or state == UNKNOWN
+                rough += state != EXACT
+                both += value
+            error = math.inf
+            if not unknown:
+                # Halves may agree with the whole by chance: at once no more than so much is gained.
+                before = values[top, 2] if values[top, 2] < math.inf else 2.0 * max(both, values[top, 0])
+                error = max(0.4 * abs(both - values[top, 0]), 0.1 * before)
+                if rough == 0:
+                    error = 0.0
+            if error <= values[top, 1]:
+                total += both
+                doubt += error
+                top -= 1
+                continue
+            target = top
+            for half in range(2):
+                row = top + 1 + half
+                if numbers[row, 4] == EXACT:
+                    total += values[row, 0]
+                    continue
+                values[row, 1] = allowed
+                values[row, 2] = error / rough
+                if row != target:
+                    _move(cells, numbers, values, row, target)
+                target += 1
+            top = target - 1
+    return total, max(doubt, 1e-15 * total), True
