@@ -19,6 +19,7 @@ from radiosity.form_factors._pairs import _PLAIN, CLEARS, HIDES, _heights, cross
 from radiosity.form_factors.analytic import _clip_pair
 from workbench.culling.tally import CLOSED, COMPLEX, DARK, SHAFT_CULL, SHAFT_TEST
 from workbench.geometry.lambert import lambert_piece
+from workbench.geometry.planes import clip_by_plane
 
 ROWS = 128
 """Most cells that wait to be halved."""
@@ -27,17 +28,30 @@ MOST_CELLS = 5_000
 SHORT = 24
 """Candidates of a cell that are cut at once; of a longer list the larger end is halved first."""
 
+NARROW = 1.0
+"""Width of a shadow, in radii of a cell, below which the cell's points may miss it."""
+
+PARTS = 48
+"""Most parts into which an end is cut beforehand, along what touches it."""
+TOUCHING = 0.02
+"""Height over an end, in its own extents, up to which an occluder casts a sharp shadow on it."""
+
 UNKNOWN, ROUGH, EXACT = -1, 0, 1
 
 
-def cell_workspace(occluders):
-    """Scratch of one thread: cells' corners (eight rows each), numbers, candidates, and their values."""
+def cell_workspace(occluders, room):
+    """Scratch of one thread: cells' corners (eight rows each), numbers, values, candidates, a rule; parts of an end.
+
+    ``room`` is the number of corners that a part may have.
+    """
     return (
         np.empty((8 * ROWS, 3)),
         np.empty((ROWS, 5), dtype=np.int64),
         np.empty((ROWS, 4)),
         np.empty(32 * (occluders + 1) + 4096, dtype=np.int64),
         np.empty((4, 4)),
+        np.empty((PARTS + 1, room, 3)),
+        np.empty(PARTS, dtype=np.int64),
     )
 
 
@@ -131,7 +145,9 @@ def _cell_value(
     row, allowed, ns, nt, cells, numbers, arena, rule, kc, ks, kn, kd, through, fragments, sizes, weights, contour,
     tally,
 ):  # fmt: skip
-    """What the ends of a cell exchange past its candidates, the doubt of that, and how it was found."""
+    """What the ends of a cell exchange past its candidates, the doubt of that or, if it is seen in part, what they
+    would exchange without, and how it was found.
+    """
     s0, t0 = 8 * row, 8 * row + 4
     size_s, size_t = numbers[row, 0], numbers[row, 1]
     begin, many = numbers[row, 2], numbers[row, 3]
@@ -159,6 +175,7 @@ def _cell_value(
         return value, rounding + 0.1 * allowed, EXACT
     tally[COMPLEX] += 1
     d = nt[0] * cells[t0, 0] + nt[1] * cells[t0, 1] + nt[2] * cells[t0, 2]
+    whole = 0.0
     for p in range(corners):
         if nt[0] * rule[p, 0] + nt[1] * rule[p, 1] + nt[2] * rule[p, 2] <= d:
             continue
@@ -169,7 +186,32 @@ def _cell_value(
         if share < 0.0:
             return 0.0, 0.0, UNKNOWN
         total += rule[p, 3] * share
-    return total, 0.0, ROUGH
+        whole += rule[p, 3] * lambert_piece(
+            rule[p, 0], rule[p, 1], rule[p, 2], ns[0], ns[1], ns[2], cells, t0, t0 + size_t
+        )
+    return total, whole, ROUGH
+
+
+@njit(**_PLAIN)
+def _may_be_missed(row, allowed, cells, numbers, values, arena, flow, fhigh, klow, khigh):
+    """Whether a candidate's shadow may lie between the points of a cell: narrower than it, with a narrow penumbra."""
+    s0, t0 = 8 * row, 8 * row + 4
+    sx, sy, sz, sr = _ball(cells, s0, numbers[row, 0])
+    tx, ty, tz, tr = _ball(cells, t0, numbers[row, 1])
+    far = math.sqrt((tx - sx) ** 2 + (ty - sy) ** 2 + (tz - sz) ** 2)
+    # Over so much of a candidate's distance the penumbra of the cell's other end spreads.
+    wide = min(2.0 * tr / far, 1.0) if far > 0.0 else 1.0
+    for c in range(numbers[row, 2], numbers[row, 2] + numbers[row, 3]):
+        k = arena[c]
+        width = min(fhigh[k, 0] - flow[k, 0], fhigh[k, 1] - flow[k, 1])
+        if width > NARROW * sr or values[row, 3] * width <= allowed * sr:
+            continue
+        gx = max(klow[k, 0] - sx, 0.0, sx - khigh[k, 0])
+        gy = max(klow[k, 1] - sy, 0.0, sy - khigh[k, 1])
+        gz = max(klow[k, 2] - sz, 0.0, sz - khigh[k, 2])
+        if wide * math.sqrt(gx * gx + gy * gy + gz * gz) < NARROW * sr:
+            return True
+    return False
 
 
 @njit(**_PLAIN)
@@ -201,10 +243,63 @@ def _fan(ring, count, part, ox, oy, oz, cells, target):
 
 
 @njit(**_PLAIN)
+def _cut_along_touching(
+    ring, count, ox, oy, oz, ns, kc, ks, kn, kd, klow, khigh, arena, begin, many, slack, parts, part_sizes
+):  # fmt: skip
+    """Convex parts of an end, cut by the planes of the occluders that touch it: there what is seen of it jumps.
+
+    They go to ``parts[:n]``, in the frame of the occluders; returns n.
+    """
+    extent = 0.0
+    for axis in range(3):
+        o = ox if axis == 0 else oy if axis == 1 else oz
+        low, high = math.inf, -math.inf
+        for c in range(count):
+            parts[0, c, axis] = ring[c, axis] + o
+            low, high = min(low, parts[0, c, axis]), max(high, parts[0, c, axis])
+        extent = max(extent, high - low)
+    part_sizes[0] = count
+    made = 1
+    near = TOUCHING * extent
+    d = ns[0] * parts[0, 0, 0] + ns[1] * parts[0, 0, 1] + ns[2] * parts[0, 0, 2]
+    tiny = max(slack, 1e-6 * extent)
+    for c in range(begin, begin + many):
+        k = arena[c]
+        lo, hi = _heights(ns[0], ns[1], ns[2], d, kc, ks[k], ks[k + 1])
+        if lo > near or hi <= tiny:
+            continue
+        before = made
+        for p in range(before):
+            size = part_sizes[p]
+            apart = False
+            for axis in range(3):
+                low, high = math.inf, -math.inf
+                for i in range(size):
+                    low, high = min(low, parts[p, i, axis]), max(high, parts[p, i, axis])
+                if klow[k, axis] > high + near or khigh[k, axis] < low - near:
+                    apart = True
+            if apart:
+                continue
+            lo, hi = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], parts[p], 0, size)
+            if lo >= -tiny or hi <= tiny or made == PARTS:
+                continue
+            front = clip_by_plane(parts[p], size, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], slack, parts[made])
+            back = clip_by_plane(parts[p], size, -kn[k, 0], -kn[k, 1], -kn[k, 2], -kd[k], slack, parts[PARTS])
+            if front < 3 or back < 3:
+                continue
+            part_sizes[made], part_sizes[p] = front, back
+            for i in range(back):
+                for axis in range(3):
+                    parts[p, i, axis] = parts[PARTS, i, axis]
+            made += 1
+    return made
+
+
+@njit(**_PLAIN)
 def refined_exchange(
     i, j, begin, many, given, tolerance, corners, start, normal, radius, group, kc, ks, kn, kd, kg, through, frame,
-    flat, flow, fhigh, slack, fragments, sizes, weights, points, pair, contour, cells, numbers, values, arena, rule,
-    tally,
+    flat, flow, fhigh, klow, khigh, slack, fragments, sizes, weights, points, pair, contour, cells, numbers, values,
+    arena, rule, parts, part_sizes, tally,
 ):  # fmt: skip
     """Exchange area of two pieces behind the occluders ``given[begin:begin + many]`` and the estimate of its error.
 
@@ -227,14 +322,24 @@ def refined_exchange(
             return 0.0, 0.0, False
         arena[root] = given[c]
         root += 1
-    fans_s = 1 if count_s <= 4 else count_s - 2
+    cuts = _cut_along_touching(
+        pair[ring_s], count_s, ox, oy, oz, ns, kc, ks, kn, kd, klow, khigh, arena, 0, root, slack, parts, part_sizes
+    )
     fans_t = 1 if count_t <= 4 else count_t - 2
-    share = tolerance / math.sqrt(fans_s * fans_t)
+    cells_s = 0
+    for cut in range(cuts):
+        cells_s += 1 if part_sizes[cut] <= 4 else part_sizes[cut] - 2
+    share = tolerance / math.sqrt(cells_s * fans_t)
     total = doubt = 0.0
     made = 0
-    for part in range(fans_s * fans_t):
-        numbers[0, 0] = _fan(pair[ring_s], count_s, part // fans_t, ox, oy, oz, cells, 0)
-        numbers[0, 1] = _fan(pair[ring_t], count_t, part % fans_t, ox, oy, oz, cells, 4)
+    cut = part = 0
+    for number in range(cells_s * fans_t):
+        if number % fans_t == 0 and number > 0:
+            part += 1
+            if part >= (1 if part_sizes[cut] <= 4 else part_sizes[cut] - 2):
+                cut, part = cut + 1, 0
+        numbers[0, 0] = _fan(parts[cut], part_sizes[cut], part, 0.0, 0.0, 0.0, cells, 0)
+        numbers[0, 1] = _fan(pair[ring_t], count_t, number % fans_t, ox, oy, oz, cells, 4)
         # Row -> its candidates (first and number); value, share of the error allowed, error of what it came from.
         numbers[0, 2], numbers[0, 3], numbers[0, 4] = 0, root, UNKNOWN
         values[0, 0], values[0, 1], values[0, 2] = 0.0, share, math.inf
@@ -255,7 +360,7 @@ def refined_exchange(
         if state == EXACT:
             total, doubt = total + value, doubt + off
             continue
-        values[0, 0], numbers[0, 4] = value, state
+        values[0, 0], values[0, 3], numbers[0, 4] = value, off, state
         top = 0
         while top >= 0:
             made += 1
@@ -305,7 +410,7 @@ def refined_exchange(
                     weights, contour, tally,
                 )  # fmt: skip
                 free += left
-                numbers[row, 4], values[row, 0] = state, value
+                numbers[row, 4], values[row, 0], values[row, 3] = state, value, off
                 if state == EXACT:
                     doubt += off
                 unknown = unknown or state == UNKNOWN
@@ -318,7 +423,10 @@ def refined_exchange(
                 error = max(0.4 * abs(both - values[top, 0]), 0.1 * before)
                 if rough == 0:
                     error = 0.0
-            if error <= values[top, 1]:
+            if error <= values[top, 1] and (
+                rough == 0
+                or not _may_be_missed(top, values[top, 1], cells, numbers, values, arena, flow, fhigh, klow, khigh)
+            ):
                 total += both
                 doubt += error
                 top -= 1

@@ -246,7 +246,7 @@ def stripe(
     corners, start, normal, offset, centroid, area, radius, low, high, group, rules, rule_starts, fine, fine_start,
     kc, ks, kn, kd, kg, through, frame, flat, flow, fhigh, klow, khigh, slack, error, share_error, floor, first,
     levels, reach, limit, importance, fragments, sizes, weights, points, pair, kept, contour, sums, cells, numbers,
-    values, short, rule, shaft, box, arena, stack, out, spread, flagged, threshold, tally,
+    values, short, rule, parts, part_sizes, shaft, box, arena, stack, out, spread, flagged, threshold, tally,
 ):  # fmt: skip
     """Exchange areas of the pieces of node ``top`` with all pieces that come after each.
 
@@ -358,12 +358,12 @@ def stripe(
                         sizes, weights, points, pair, kept, contour, sums, tally,
                     )  # fmt: skip
                 weight = importance[i] + importance[j]
-                if weight * max(doubt, RAY_DOUBT * value * rays) > threshold:
+                if threshold < math.inf and weight * max(doubt, RAY_DOUBT * value * rays) > threshold:
                     refined += 1
                     better, off, whole = refined_exchange(
                         i, j, begin, many, arena, threshold / weight, corners, start, normal, radius, group, kc, ks,
-                        kn, kd, kg, through, frame, flat, flow, fhigh, slack, fragments, sizes, weights, points, pair,
-                        contour, cells, numbers, values, short, rule, tally,
+                        kn, kd, kg, through, frame, flat, flow, fhigh, klow, khigh, slack, fragments, sizes, weights,
+                        points, pair, contour, cells, numbers, values, short, rule, parts, part_sizes, tally,
                     )  # fmt: skip
                     if whole:
                         value, doubt, rays = better, off, 0

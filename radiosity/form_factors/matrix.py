@@ -21,6 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from radiosity.form_factors import _pairs, _stripes
+from radiosity.form_factors._covered import covered_pieces
 from radiosity.form_factors._ray_shares import MOST_RAYS, ray_shares
 from radiosity.form_factors._refine import cell_workspace
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
@@ -52,7 +53,7 @@ COVERED = 0.01
 """Share of a row of a closed scene that must be missing to count as covered (the floor under a box)."""
 BLOCK_ROWS = 128
 """Rows of a matrix that a thread takes at once."""
-REFINEMENTS, AIM = 3, 0.7
+REFINEMENTS, AIM = 3, 1.0
 """Most rounds of refining, and the part of the wanted error that they aim at."""
 ROUNDS = 200
 """Most rounds of the scaling that closes rows."""
@@ -378,9 +379,7 @@ class _Care:
             # Mean error of a share by rules of 1, 3, 12, 48, ... points a triangle: 5 %, 2.5 %, 0.6 %, 0.2 %, ...
             # Few and large polygons have more in their shadows: they get a level more.
             first=first,
-            levels=min(
-                2 - (first == 0) + sum(error < limit for limit in (1e-2, 3e-3, 4e-4, 5e-5)) + (count < LARGE), 6
-            ),
+            levels=2 if loose and count < LARGE else (1, 2)[first] + sum(error < e for e in (1e-2, 3e-3, 4e-4, 5e-5)),
             limit=min(12 if error > 5e-3 else 32 if count >= LARGE else _pairs.MAX_CUT, _pairs.MAX_CUT),
             reach=np.array([(factor / relative) ** (1.0 / power) for factor, power in rules]),
         )
@@ -421,15 +420,18 @@ class _Engine:
         points = np.concatenate([points for _, points in levels])
         level_starts = np.stack([start + end for (start, _), end in zip(levels, ends[:-1], strict=True)])
         fine_start, fine = _rule_points(p, _TRIANGLE_6, _gauss_square(3, 1))
-        starts = o.start[:-1]
+        self._polygon = mesh.element_polygon
+        self._occluder_boxes = [
+            bound.reduceat(o.corners, o.start[:-1]) if o.count else np.empty((0, 3))
+            for bound in (np.minimum, np.maximum)
+        ]
         self._nodes = (t.first, t.last, t.left, t.right, t.low, t.high, t.group, t.normal, t.offset)
         self._constant = (
             p.corners, p.start, p.normal, p.offset, p.centroid, p.area, p.radius, p.low, p.high, p.group,
             points, level_starts, fine, fine_start,
             o.corners, o.start, o.normal, o.offset, o.group, o.through, frame, flat, flow, fhigh,
-            np.minimum.reduceat(o.corners, starts) if o.count else np.empty((0, 3)),
-            np.maximum.reduceat(o.corners, starts) if o.count else np.empty((0, 3)),
-            o.slack, care.error, care.share_error, care.floor, care.first, care.levels, care.reach, care.limit,
+            *self._occluder_boxes, o.slack, care.error, care.share_error, care.floor, care.first, care.levels,
+            care.reach, care.limit,
         )  # fmt: skip
         self._corners = int(max(np.diff(p.start).max(), np.diff(o.start).max(initial=3), 8))
         self._idle: list[tuple[Any, ...]] = []
@@ -440,7 +442,7 @@ class _Engine:
         widest = int((self.tree.last - self.tree.first)[self.tree.stripes].max())
         return (
             *_pairs.pair_workspace(self._corners),
-            *cell_workspace(self.occluders.count),
+            *cell_workspace(self.occluders.count, 2 * self._corners + 16),
             np.empty((MAX_SHAFT_PLANES, 4)),
             np.empty((16, 3)),
             np.empty(96 * (self.occluders.count + 1), dtype=np.int64),
@@ -499,6 +501,21 @@ class _Engine:
         out[i - base, j] = whole * share
         spread[i - base, j] = spread[i - base, j] * share + whole * doubt
         return traced
+
+    def touched(self, row_of: IntArray, rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which of the asked rows have something standing or lying on them."""
+        p, o = self.pieces, self.occluders
+        asked = np.flatnonzero(rows[row_of])
+        out = np.zeros(len(asked), dtype=bool)
+        if len(asked):
+            covered_pieces(
+                asked, p.corners, p.start, p.normal, p.low, p.high, p.group, p.side, self._polygon[p.owner],
+                o.corners, o.start, o.group, self._occluder_boxes[0], self._occluder_boxes[1],
+                max(o.slack, 1e-9 * self.geometry.size), out,
+            )  # fmt: skip
+        found = np.zeros(len(rows), dtype=bool)
+        found[row_of[asked[out]]] = True
+        return found
 
     def prepare_rays(self) -> None:
         """Build Embree's tree before threads need it."""
@@ -753,8 +770,10 @@ def view_factors(
     -----
     Clear pairs get a closed form or a quadrature of that accuracy; pairs behind a few polygons are cut
     exactly at the points of a rule (facets of one plane block as one polygon); only the rest gets rays.
-    In a scene declared closed rows are closed by a symmetric scaling, see :func:`close_rows`; a row that
-    lacks more than 1 % (and than twice its error) is covered by something and keeps what it has.
+    Then the pairs that make the stated error larger than ``error``, and only those, are refined: both ends are
+    halved where the pair's error is made.
+    In a scene declared closed rows are closed by a symmetric scaling, see :func:`close_rows`; a row on which
+    something stands and that lacks more than 1 % (and than four times its error) is covered and keeps what it has.
     """
     threads = workers if workers is not None else len(os.sched_getaffinity(0))
     if by not in ("patch", "surface"):
@@ -796,7 +815,7 @@ def view_factors(
     with record.stage("exchange areas"):
         exchange, spread = _all_exchanges(engine, row_of[pieces.owner], areas, threads, record, progress, error)
     with record.stage("close"):
-        found = _finished(scene, exchange, spread, areas, names, record, threads)
+        found = _finished(scene, exchange, spread, areas, names, record, engine, row_of[pieces.owner], threads)
     record.results.update(rows=len(names), pieces=n, occluders=engine.occluders.count, sparse=found.sparse)
     return found
 
@@ -866,7 +885,8 @@ def _all_exchanges(
         for node, stripe in zip(stripes, each, strict=True):
             add_tally(record.counters, stripe.tally)
             record.counters.add(rays=stripe.rays)
-            found[node] = _merged(stripe, rows) if rows < n else stripe
+            # Several pieces a row: add up what belongs together at once.
+            found[node] = stripe if rows == n else _Stripe(*_merged(*stripe[:4], rows), *stripe[4:])
             done += int((tree.last[node] - tree.first[node]) * (2 * n - tree.first[node] - tree.last[node]))
             if progress is not None and threshold == math.inf:
                 progress(min(done / n**2, 1.0))
@@ -884,42 +904,29 @@ def _all_exchanges(
             record.results["refined_pairs"] = sum(stripe.refined for stripe in found.values())
         parts = [found[node][:4] for node in tree.stripes.tolist()]
         found.clear()
-        if rows == n:
-            return _symmetric(parts, rows, pool.map)
-    r, c, value, doubt = (np.concatenate([part[k] for part in parts]) for k in range(4))
-    parts.clear()
-    both = scipy.sparse.coo_array((value, (r, c)), shape=(rows, rows)).tocsr()
-    square = scipy.sparse.coo_array((doubt.astype(np.float64) ** 2, (r, c)), shape=(rows, rows)).tocsr()
-    # On the diagonal both directions are one: the sum of both is twice the half.
-    exchange = scipy.sparse.csr_array(both + both.T)
-    spread = scipy.sparse.csr_array((square + square.T).sqrt().astype(np.float32))
-    if SPARSE_ENTRY * exchange.nnz >= DENSE_ENTRY * rows**2:
-        return exchange.toarray(), spread.toarray()
-    for matrix in (exchange, spread):
-        matrix.sort_indices()
-    return exchange, spread
+        if rows < n:
+            r, c, value, doubt = (np.concatenate([part[k] for part in parts]) for k in range(4))
+            parts = [_merged(r, c, value, doubt, rows)]
+        return _symmetric(parts, rows, pool.map)
 
 
-def _merged(stripe: _Stripe, rows: int) -> _Stripe:
-    """What belongs to the same rows added up; errors as those of independent pairs."""
-    key = np.minimum(stripe.row, stripe.column) * np.int64(rows) + np.maximum(stripe.row, stripe.column)
-    key, place = np.unique(key, return_inverse=True)
+def _merged(
+    row: NDArray[np.int32], column: NDArray[np.int32], value: FloatArray, error: NDArray[np.float32], rows: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32], FloatArray, NDArray[np.float32]]:
+    """What belongs to the same two rows added up; errors as those of independent pairs."""
+    key, place = np.unique(np.minimum(row, column) * np.int64(rows) + np.maximum(row, column), return_inverse=True)
     place = place.ravel()
     low, high = np.divmod(key, rows)
-    square = np.bincount(place, np.square(stripe.error, dtype=np.float64), len(key))
-    return stripe._replace(
-        row=low.astype(np.int32),
-        column=high.astype(np.int32),
-        value=np.bincount(place, stripe.value, len(key)).astype(np.float64),
-        error=np.sqrt(square).astype(np.float32),
-    )
+    square = np.bincount(place, np.square(error, dtype=np.float64), len(key))
+    total = np.bincount(place, value, len(key)).astype(np.float64)
+    return low.astype(np.int32), high.astype(np.int32), total, np.sqrt(square).astype(np.float32)
 
 
 def _stated(stripes: list[_Stripe], areas: FloatArray) -> float:
     """Mean over the rows of the sum of all errors."""
     total = 0.0
     for stripe in stripes:
-        total += float(stripe.error @ (1.0 / areas[stripe.row] + 1.0 / areas[stripe.column]))
+        total += float(stripe.error @ (1.0 / areas)[stripe.row] + stripe.error @ (1.0 / areas)[stripe.column])
     return total / len(areas)
 
 
@@ -957,7 +964,11 @@ def _blocks(rows: int) -> list[tuple[int, int]]:
 
 def _symmetric(parts: list[tuple[Any, ...]], rows: int, each: Callable[..., Any]) -> tuple[Matrix, Matrix]:
     """The whole matrices of distinct pairs (r, c, value, error), which are given up on the way."""
-    count = 2 * sum(len(part[0]) for part in parts)
+    for r, c, value, error in parts:
+        # Pieces of one row that see each other do so both ways.
+        value[r == c] *= 2.0
+        error[r == c] *= math.sqrt(2.0)
+    count = sum(2 * len(r) - int((r == c).sum()) for r, c, _, _ in parts)
     if SPARSE_ENTRY * count >= DENSE_ENTRY * rows**2:
         dense, dense_error = np.zeros((rows, rows)), np.zeros((rows, rows), dtype=np.float32)
         while parts:
@@ -996,7 +1007,8 @@ def _count_rows(r, c, start):
     """Add the entries of each row, both ways, to the place after it."""
     for k in range(r.shape[0]):
         start[r[k] + 1] += 1
-        start[c[k] + 1] += 1
+        if c[k] != r[k]:
+            start[c[k] + 1] += 1
 
 
 @njit(nogil=True, cache=True)
@@ -1004,10 +1016,13 @@ def _place_pairs(r, c, value, error, place, column, data, errors):
     """Put each pair to the next place of both its rows."""
     for k in range(r.shape[0]):
         i, j = r[k], c[k]
-        p, q = place[i], place[j]
+        p = place[i]
         column[p], data[p], errors[p] = j, value[k], error[k]
-        column[q], data[q], errors[q] = i, value[k], error[k]
-        place[i], place[j] = p + 1, q + 1
+        place[i] = p + 1
+        if i != j:
+            q = place[j]
+            column[q], data[q], errors[q] = i, value[k], error[k]
+            place[j] = q + 1
 
 
 @njit(nogil=True, cache=True)
@@ -1036,6 +1051,8 @@ def _finished(
     areas: FloatArray,
     names: list[str],
     record: RunRecord,
+    engine: _Engine,
+    row_of: IntArray,
     threads: int,
 ) -> ViewFactors:
     """Close the rows of an enclosure, divide by the areas, and say how good it is."""
@@ -1056,7 +1073,8 @@ def _finished(
         each(lambda first, last: _row_sums(first, last, start, data, errors, areas, sums, stated, doubt))
         record.errors["stated_row_error_as_found"] = float(stated.mean())
         if scene.closed:
-            covered = 1.0 - sums > np.maximum(4.0 * doubt, max(0.5 * record.settings["error"], COVERED))
+            covered = 1.0 - sums > np.maximum(4.0 * doubt, COVERED)
+            covered &= engine.touched(row_of, covered)
             x = close_rows(exchange, np.where(covered, sums * areas, areas))
             record.results["covered_rows"] = int(covered.sum())
         each(lambda first, last: _scale_rows(first, last, start, column, data, errors, x, areas, worst))
