@@ -53,7 +53,7 @@ COVERED = 0.01
 """Share of a row of a closed scene that must be missing to count as covered (the floor under a box)."""
 BLOCK_ROWS = 128
 """Rows of a matrix that a thread takes at once."""
-REFINEMENTS, AIM = 3, 1.0
+REFINEMENTS, AIM = 3, 0.8
 """Most rounds of refining, and the part of the wanted error that they aim at."""
 ROUNDS = 200
 """Most rounds of the scaling that closes rows."""
