@@ -77,8 +77,9 @@ def test_surfaces_are_the_area_weighted_sum_of_their_polygons(room, found):
     exchange = np.zeros((len(by.names), len(by.names)))
     np.add.at(exchange, (owner[:, None], owner[None, :]), found.areas[:, None] * found.dense())
     assert by.areas == pytest.approx(np.bincount(owner, found.areas))
-    # Closed on surfaces there, on polygons here.
-    assert by.areas[:, None] * by.dense() == pytest.approx(exchange, abs=3e-4 * by.areas.max())
+    # Closed on surfaces there, on polygons here; 1e-3 was asked of either.
+    off = np.abs(by.dense() - exchange / by.areas[:, None])
+    assert off.sum(axis=1).mean() < 2e-3
     assert np.abs(by.dense().sum(axis=1) - 1).max() < 1e-9
 
 
