@@ -6,8 +6,9 @@ surfaces, divided by the area-weighted mean irradiance; the irradiance is what
 gathered from the mesh.  It has four parts, each estimated on its own, and their sum is compared
 with the target:
 
-* *meshing*: the same points are asked under two meshes, and the difference is extrapolated
-  (L. F. Richardson 1911) with the order at which it was seen to fall;
+* *meshing*: the same points are asked under a mesh and a coarser one, and the difference is extrapolated
+  (L. F. Richardson 1911) with the order at which it was seen to fall.  Of the full matrix the coarser mesh
+  is that of its patches, whose form factors are sums of those of the elements: it costs nothing;
 * *form factors* and *visibility*: the stated errors of what formulas and rays found, B F A by B F A;
 * *convergence*: the bound residual / (1 - rho) on light that is still unshot.
 """
@@ -26,36 +27,46 @@ from radiosity.form_factors._sampling import place_on_pieces
 from radiosity.patches import PatchMesh, build_mesh
 from radiosity.sensors import Gatherer
 from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, Solution
+from radiosity.solvers.solve import begin, require_matrix_memory, solve_by_matrix
 from radiosity.solvers.solve import solve as solve_once
 from workbench.counters import Counters
 from workbench.errors import MemoryForecastError, OptionError
+from workbench.geometry.flat import Geometry
 from workbench.scene.model import Scene
+from workbench.shadow.occlusion import Shader
 
 __all__ = ["ErrorEstimate", "solve", "surface_points"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-POINTS = 256
-"""Points at which two meshes are compared."""
-GATHER_RAYS = 1024
-"""Rays a point for that comparison: the same rays each time, so that their own error cancels."""
-NOISE, MOST_DRAWS = 0.004, 16
-"""What one such comparison cannot tell from nothing, and the most that are averaged."""
+LOOKS = ((0.02, 64, 32, 2), (0.005, 128, 32, 2), (0.002, 256, 256, 2), (0.0, 256, 1024, 4))
+"""From so large an asked error on: points at which two meshes are compared, rays from each, and looks.
+
+(Sampling moves the estimate by 15 % with the first; what two looks differ by is no part of it.)"""
 ORDER = 0.9
 """Power of the number of elements with which the meshing error falls, until it has been seen to."""
 ORDERS = (0.5, 1.5)
 """Orders that are believed when seen."""
-FIRST_ELEMENTS = 1.5
-"""Elements of the first mesh, over the asked error."""
-LEAST_FIRST_ERROR = 0.001
+ROOM_ERROR = 1.8
+"""Meshing error of a room, times the number of elements to the power ``ORDER``: the first guess (Cornell box)."""
+MOST_FIRST = 450
+"""Most elements of the first mesh: what it tells is worth more than any guess."""
 BUDGET_ELEMENTS = 64
 """Most elements of the first mesh where time is limited: it is solved whatever it takes."""
+SAFE = 0.85
+"""Share of the asked error below which the estimate must fall: it is one itself."""
 MESHING_SHARE = 0.7
 """Share of the error that the mesh may take."""
+FACTOR_SHARE, MOST_FACTOR_ERROR = 0.5, 0.05
+"""Error of the rows of form factors, over the asked error, and the largest."""
+LEAST_DIVIDED = 1.7
+"""Least ratio of elements to patches: with less, too little of the mesh is divided to tell what it leaves."""
+NEAR = 0.7
+"""Share of the elements asked for from which a mesh is near enough."""
 LEAST_GROWTH, MOST_STUCK = 1.3, 8
 """Growth below which a mesh counts as the same, and how often the number asked for is doubled then."""
-GROWTH = (2.5, 8.0)
+GROWTH = (1.6, 8.0)
 """Least and largest growth of the number of elements from mesh to mesh."""
 COST_POWER = 1.7
 """Power of the number of elements with which the seconds grow."""
@@ -130,7 +141,7 @@ class _Run:
     settings: dict[str, Any]
     start: float = field(default_factory=time.perf_counter)
     levels: list[dict[str, Any]] = field(default_factory=list)
-    seen: FloatArray | None = None
+    care: float = 1.0
     counters: Counters = field(default_factory=Counters)
     spent: dict[str, float] = field(default_factory=dict)
     choices: dict[str, str] = field(default_factory=dict)
@@ -185,12 +196,15 @@ def _watched(progress: Progress | None, run: _Run, message: str, stoppable: bool
 
 def _order(levels: list[dict[str, Any]]) -> float:
     """The order at which the difference between meshes falls, as far as it can be told."""
-    differences = [level["difference"] for level in levels if level["difference"] is not None]
-    counts = [level["elements"] for level in levels]
-    if len(differences) < 2 or min(differences[-2:]) <= 0:
+    told = [level for level in levels if level["difference"] is not None]
+    if len(told) < 2 or min(level["difference"] for level in told[-2:]) <= 0:
         return ORDER
+    before, after = told[-2:]
     # The difference of two meshes is about the error of the coarser one.
-    slope = math.log(differences[-2] / differences[-1]) / math.log(counts[-2] / counts[-3])
+    growth = after["coarse_elements"] / before["coarse_elements"]
+    if growth < LEAST_GROWTH:
+        return ORDER
+    slope = math.log(before["difference"] / after["difference"]) / math.log(growth)
     return min(max(slope, ORDERS[0]), ORDERS[1])
 
 
@@ -275,19 +289,36 @@ def _first_error(run: _Run) -> float:
     return run.target if run.target > 0 else 0.1
 
 
-def _look(gatherer: Gatherer, where: tuple[FloatArray, FloatArray, IntArray], run: _Run) -> FloatArray:
-    """Irradiance at the points, by the same rays for every mesh.
+def _effort(run: _Run) -> tuple[int, int, int]:
+    """Points, rays and looks of a comparison."""
+    return next(row[1:] for row in LOOKS if _first_error(run) >= row[0])
 
-    Only what is gathered again at a few hits is drawn anew: for small targets the mean over several draws.
+
+def _look(gatherers: list[Gatherer], where: tuple[FloatArray, FloatArray, IntArray], run: _Run) -> FloatArray:
+    """Indirect irradiance (looks, solutions, points, bands) at points, by the same rays for every solution."""
+    points, normals, _ = where
+    _, rays, looks = _effort(run)
+    return np.array(
+        [
+            [each.indirect(points, normals, rays=rays, counters=run.counters, seed=seed).indirect for each in gatherers]
+            for seed in range(1, looks + 1)
+        ]
+    )
+
+
+def _difference(fine: FloatArray, coarse: FloatArray, mean: float) -> float:
+    """Root mean square over the points of what two solutions differ by, relative to the mean irradiance.
+
+    Of looks (looks, points, bands) with other rays: noise has no part in the products of different looks.
+    Their standard error is added.
     """
-    draws = min(max(round((NOISE / _first_error(run)) ** 2), 1), MOST_DRAWS)
-    total = np.zeros((len(where[0]), gatherer.solution.mesh.bands))
-    for seed in range(1, draws + 1):
-        gatherer.seed = seed
-        total += gatherer.irradiance(
-            where[0], where[1], own_polygon=where[2], rays=GATHER_RAYS, error=max(_first_error(run), 1e-4)
-        ).irradiance
-    return total / draws
+    if mean <= 0.0:
+        return 0.0
+    off = fine - coarse
+    looks = len(off)
+    products = ((off.sum(axis=0) ** 2 - (off**2).sum(axis=0)) / (looks * (looks - 1))).mean(axis=1)
+    square = products.mean() + products.std() / math.sqrt(len(products))
+    return math.sqrt(max(float(square), 0.0)) / mean
 
 
 def _method(scene: Scene, run: _Run) -> str:
@@ -303,57 +334,211 @@ def _method(scene: Scene, run: _Run) -> str:
     return "progressive"
 
 
+def _first_count(run: _Run) -> int:
+    """Number of elements of the first mesh."""
+    guess = (ROOM_ERROR / (MESHING_SHARE * _first_error(run))) ** (1.0 / ORDER)
+    return math.ceil(min(guess, BUDGET_ELEMENTS if math.isfinite(run.seconds) else MOST_FIRST))
+
+
+def _patches_as_elements(mesh: PatchMesh) -> PatchMesh:
+    """The mesh whose elements are the patches of another, each a patch of its own."""
+    n, first = mesh.patch_count, mesh.patch_start[:-1]
+    piece_element = np.repeat(np.arange(n), np.diff(mesh.patch_sender)).astype(np.int64)
+    centroid = mesh.patch_mean(mesh.element_centroid)
+    away = np.linalg.norm(mesh.sender_corners - centroid[np.repeat(piece_element, np.diff(mesh.sender_start))], axis=1)
+    return replace(
+        mesh,
+        corners=mesh.sender_corners,
+        piece_start=mesh.sender_start,
+        piece_element=piece_element,
+        piece_normal=mesh.sender_normal,
+        element_area=mesh.patch_area,
+        element_normal=mesh.patch_normal,
+        element_centroid=np.ascontiguousarray(centroid),
+        element_size=2.0 * np.maximum.reduceat(away, mesh.sender_start[mesh.patch_sender[:-1]]),
+        element_polygon=mesh.patch_polygon,
+        element_surface=mesh.element_surface[first],
+        element_side=mesh.element_side[first],
+        element_patch=np.arange(n),
+        reflectance=np.ascontiguousarray(mesh.reflectance[first]),
+        emission=np.ascontiguousarray(mesh.emission[first]),
+        patch_start=np.arange(n + 1),
+    )
+
+
+class _Patches:
+    """Meshes solved with the full matrix, each compared with its own patches."""
+
+    def __init__(self, scene: Scene, run: _Run, progress: Progress | None, checkpoint: Checkpoint | None) -> None:
+        self.scene, self.run, self.progress, self.checkpoint = scene, run, progress, checkpoint
+        self.gatherer: Gatherer | None = None
+        self.shader: Shader | None = None
+
+    def solve(self, count: int, stoppable: bool) -> Solution:
+        """Solve a mesh of about so many elements, and its patches."""
+        run = self.run
+        # No finer than this mesh can be right.
+        finest = max(run.target, 0.3 / count)
+        factor_error = min(run.care * FACTOR_SHARE * finest, MOST_FACTOR_ERROR)
+        asked = run.options | {"method": "matrix", "elements": count, "form_factor_error": factor_error}
+        record = begin(self.scene, **asked)
+        with record.stage("mesh"):
+            if self.shader is None:
+                self.shader = Shader(Geometry.from_scene(self.scene), record.settings["workers"])
+            mesh = self._divided(count)
+            patches = _patches_as_elements(mesh)
+        require_matrix_memory(mesh.element_count)
+        watched = _watched(self.progress, run, f"mesh {len(run.levels) + 1}, about {count} elements", stoppable)
+        solution, coarse = solve_by_matrix(self.scene, self.shader, mesh, record, coarse_mesh=patches, progress=watched)
+        assert coarse is not None
+        self.coarse = coarse
+        return solution
+
+    def _divided(self, count: int) -> PatchMesh:
+        """A mesh that is finer than its patches where it matters."""
+        assert self.shader is not None
+        geometry = self.shader.geometry
+
+        def made(elements: int) -> PatchMesh:
+            return build_mesh(self.scene, geometry, elements=elements, split=2, cluster=False)
+
+        mesh = made(count)
+        if mesh.element_count < NEAR * count:
+            # Of polygons alike in size the number jumps, and no more are made than asked for.
+            larger = made(2 * count)
+            mesh = larger if larger.element_count * mesh.element_count < count**2 else mesh
+        while True:
+            if not mesh.reflectance.any() or mesh.element_count >= LEAST_DIVIDED * mesh.patch_count:
+                return mesh
+            count *= 2
+            mesh = made(count)
+
+    def compare(self, solution: Solution) -> tuple[float | None, int]:
+        """What the mesh and its patches differ by, and the number of these."""
+        mesh, coarse = solution.mesh, self.coarse
+        if not mesh.reflectance.any():
+            return 0.0, coarse.mesh.element_count
+        if self.gatherer is None:
+            self.gatherer = Gatherer(solution, shader=self.shader)
+        else:
+            self.gatherer = self.gatherer.reading(solution)
+        both = [self.gatherer, self.gatherer.reading(coarse)]
+        looks = _look(both, surface_points(mesh, _effort(self.run)[0]), self.run)
+        mean = float(solution.mean_irradiance.mean())
+        difference = _difference(looks[:, 0], looks[:, 1], mean)
+        return max(difference, _surface_difference(solution, coarse, mean)), coarse.mesh.element_count
+
+    def keep(self, solution: Solution, count: int) -> None:
+        """Let the caller save a whole mesh, from which a mesh of ``count`` elements follows."""
+        if self.checkpoint is not None:
+            solution.record.settings |= self.run.settings | {"elements": count}
+            solution.record.results["levels"] = self.run.levels
+            self.checkpoint(solution)
+
+
+def _surface_difference(fine: Solution, coarse: Solution, mean: float) -> float:
+    """Root mean square of what the mean irradiance of the polygons differs by, relative to the mean.
+
+    Points hardly feel what is wrong in the balance between surfaces that send each other much light.
+    """
+    key = 2 * fine.mesh.element_polygon + (fine.mesh.element_side < 0)
+    which, row = np.unique(key, return_inverse=True)
+    off = fine.element_irradiance - coarse.element_irradiance[fine.mesh.element_patch]
+    area = np.bincount(row, fine.mesh.element_area, len(which))
+    each = np.stack([np.bincount(row, fine.mesh.element_area * band, len(which)) for band in off.T], axis=1)
+    square = float(((each / area[:, None]) ** 2).mean(axis=1) @ area / area.sum())
+    return math.sqrt(square) / mean if mean > 0 else 0.0
+
+
+class _Meshes:
+    """Meshes solved by any other method, each compared with the one before."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        run: _Run,
+        method: str,
+        progress: Progress | None,
+        checkpoint: Checkpoint | None,
+        resume: Solution | None,
+    ) -> None:
+        self.scene, self.run, self.method, self.progress, self.checkpoint = scene, run, method, progress, checkpoint
+        self.unfinished = resume
+        self.gatherer: Gatherer | None = None
+        self.points: tuple[FloatArray, FloatArray, IntArray] | None = None
+        self.seen: FloatArray | None = None
+        stored = None if resume is None else resume.record.results.get("level_irradiance")
+        if stored is not None:
+            self.seen = np.asarray(stored)
+
+    def solve(self, count: int, stoppable: bool) -> Solution:
+        """Solve a mesh of about so many elements."""
+        run = self.run
+        finest = max(run.target, 0.3 / count)
+        unfinished, self.unfinished = self.unfinished, None
+
+        def keep(solution: Solution) -> None:
+            assert self.checkpoint is not None
+            solution.record.settings |= run.settings | {"elements": count}
+            solution.record.results["levels"] = run.levels
+            solution.record.results["level_irradiance"] = None if self.seen is None else self.seen.tolist()
+            self.checkpoint(solution)
+
+        asked = run.options | {
+            "method": self.method,
+            "elements": count,
+            "tolerance": min(0.1 * finest, 0.01),
+            "form_factor_error": min(run.care * 2.0 * finest, 0.02),
+        }
+        return solve_once(
+            self.scene,
+            progress=_watched(self.progress, run, f"mesh {len(run.levels) + 1}, about {count} elements", stoppable),
+            checkpoint=None if self.checkpoint is None else keep,
+            resume=unfinished,
+            **asked,
+        )
+
+    def compare(self, solution: Solution) -> tuple[float | None, int]:
+        """What the mesh and the one before differ by, and the number of elements of that."""
+        if self.gatherer is None:
+            self.gatherer = Gatherer(solution, workers=self.run.options.get("workers"))
+            # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
+            self.points = surface_points(build_mesh(self.scene, self.gatherer.geometry), _effort(self.run)[0])
+        assert self.points is not None
+        seen = _look([self.gatherer.reading(solution)], self.points, self.run)[:, 0]
+        before, self.seen = self.seen, seen
+        if before is None:
+            return None, 0
+        return _difference(seen, before, float(solution.mean_irradiance.mean())), self.run.levels[-1]["elements"]
+
+    def keep(self, solution: Solution, count: int) -> None:
+        """These methods save themselves within each mesh."""
+
+
 def _refine(
     scene: Scene, run: _Run, progress: Progress | None, checkpoint: Checkpoint | None, resume: Solution | None
 ) -> Solution:
-    """Solve finer and finer meshes until two of them agree."""
+    """Solve finer and finer meshes until the estimate is below the target."""
     best: Solution | None = None
-    gatherer: Gatherer | None = None
-    where: tuple[FloatArray, FloatArray, IntArray] | None = None
     estimate = ErrorEstimate(math.inf, 0.0, 0.0, 0.0)
-    count = max(16, round(FIRST_ELEMENTS / max(_first_error(run), LEAST_FIRST_ERROR)))
-    if math.isfinite(run.seconds):
-        count = min(count, BUDGET_ELEMENTS)
-    method = _method(scene, run)
-    stuck = 0
-    unfinished = resume
+    count = _first_count(run)
     if resume is not None:
         run.levels = list(resume.record.results.get("levels", []))
-        stored = resume.record.results.get("level_irradiance")
-        run.seen = None if stored is None else np.asarray(stored)
         count = int(resume.record.settings.get("elements") or count)
+    method = _method(scene, run)
+    levels: _Patches | _Meshes
+    if method == "matrix":
+        levels = _Patches(scene, run, progress, checkpoint)
+    else:
+        levels = _Meshes(scene, run, method, progress, checkpoint, resume)
+    stuck = 0
     while True:
-        # No finer than this mesh can be right.
-        finest = max(run.target, 0.3 / count)
-        options = run.options | {
-            "method": method,
-            "elements": count,
-            "tolerance": min(0.1 * finest, 0.01),
-            # Bundles state an error a form factor, the matrix one a row.
-            "form_factor_error": min(0.5 * finest, 0.005) if method == "matrix" else min(2.0 * finest, 0.02),
-        }
-        message = f"mesh {len(run.levels) + 1}, about {count} elements"
-
-        def keep(solution: Solution) -> None:
-            assert checkpoint is not None
-            solution.record.settings |= run.settings | {"elements": count}  # noqa: B023
-            solution.record.results["levels"] = run.levels
-            solution.record.results["level_irradiance"] = None if run.seen is None else run.seen.tolist()
-            checkpoint(solution)
-
         try:
-            solution = solve_once(
-                scene,
-                progress=_watched(progress, run, message, best is not None),
-                checkpoint=None if checkpoint is None else keep,
-                resume=unfinished,
-                **options,
-            )
+            solution = levels.solve(count, best is not None)
         except MemoryForecastError as refusal:
             if best is None:
                 raise
             return _finish(run, best, estimate, f"the next mesh does not fit in memory: {refusal}")
-        unfinished = None
         run.add(solution)
         if solution.stopped == "interrupted":
             reason = "out of time" if run.left < 0 else "interrupted"
@@ -368,40 +553,34 @@ def _refine(
                 return _finish(run, solution, _parts(solution, math.inf), "no finer mesh can be made")
             stuck, count = stuck + 1, 2 * count
             continue
-        begin = time.perf_counter()
-        if gatherer is None:
-            gatherer = Gatherer(solution, workers=run.options.get("workers"))
-        else:
-            gatherer = gatherer.reading(solution)
-        if where is None:
-            # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
-            where = surface_points(build_mesh(scene, gatherer.geometry), POINTS)
-        seen = _look(gatherer, where, run)
-        mean = float(solution.mean_irradiance.mean())
-        difference = None if run.seen is None else _relative_rms(seen - run.seen, mean)
-        run.seen = seen
+        start = time.perf_counter()
+        difference, coarse = levels.compare(solution)
         best, stuck = solution, 0
-        run.levels.append({"elements": n, "difference": difference, "seconds": time.perf_counter() - run.start})
+        run.levels.append({"elements": n, "coarse_elements": coarse, "difference": difference})
         order = _order(run.levels)
         meshing = math.inf
         if difference is not None:
-            meshing = difference / ((n / run.levels[-2]["elements"]) ** order - 1.0)
+            meshing = difference / ((n / coarse) ** order - 1.0) if difference > 0 else 0.0
         estimate = _parts(solution, meshing)
-        run.levels[-1] |= estimate.as_dict()
-        run.spent["error estimate"] = run.spent.get("error estimate", 0.0) + time.perf_counter() - begin
-        if estimate.total <= run.target:
+        now = time.perf_counter()
+        run.spent["error estimate"] = run.spent.get("error estimate", 0.0) + now - start
+        run.levels[-1] |= {"seconds": now - run.start} | estimate.as_dict()
+        if estimate.total <= SAFE * run.target:
             return _finish(run, solution, estimate, "the estimate is below the target")
         if len(run.levels) >= MOST_LEVELS:
             return _finish(run, solution, estimate, f"{MOST_LEVELS} meshes did not reach the target")
         want = 3.0 if not math.isfinite(meshing) else GROWTH[1]
         if run.target > 0 and math.isfinite(meshing):
             want = (meshing / (MESHING_SHARE * run.target)) ** (1.0 / order) * 1.1
+            if estimate.form_factors > 0.3 * run.target:
+                run.care *= max(0.2 * run.target / estimate.form_factors, 0.1)
         want = min(max(want, GROWTH[0]), GROWTH[1])
         took = run.levels[-1]["seconds"] - (run.levels[-2]["seconds"] if len(run.levels) > 1 else 0.0)
         fits = (max(run.left, 0.0) / max(took, 1e-3)) ** (1.0 / COST_POWER)
         if fits < GROWTH[0]:
             return _finish(run, solution, estimate, "another mesh would not fit into the time")
         count = math.ceil(n * min(want, max(fits, GROWTH[0])))
+        levels.keep(solution, count)
 
 
 def _improve_factors(scene: Scene, run: _Run, fixed: dict[str, Any], progress: Progress | None) -> Solution:

@@ -159,6 +159,8 @@ class Gatherer:
         Threads, all cores by default; the answers do not depend on it.
     seed : int
         Of the rays.
+    shader : Shader, optional
+        Over the scene's geometry, if there is one already; its threads are used.
 
     Raises
     ------
@@ -166,15 +168,17 @@ class Gatherer:
         If the solution has lost its scene, or its mesh is not of that scene.
     """
 
-    def __init__(self, solution: Solution, *, workers: int | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, solution: Solution, *, workers: int | None = None, seed: int = 0, shader: Shader | None = None
+    ) -> None:
         scene = solution.scene
         if not scene.surfaces:
             raise InputError(
                 f"{scene.name}: found a solution without its scene; its file was moved, so solve the scene again"
             )
         self.seed = seed
-        self.geometry = Geometry.from_scene(scene)
-        self.shader = Shader(self.geometry, workers)
+        self.shader = shader if shader is not None else Shader(Geometry.from_scene(scene), workers)
+        self.geometry = self.shader.geometry
         self.workers = self.shader.workers
         self._read(solution)
 

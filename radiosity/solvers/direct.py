@@ -12,18 +12,20 @@ from radiosity.form_factors.matrix import close_rows, exchange_areas
 from radiosity.solvers.lamps import lamp_irradiance, lamps_of_scene
 from radiosity.solvers.progressive import receive
 from radiosity.solvers.solution import Progress, ProgressEvent, Solution
-from workbench.geometry.flat import Geometry
 from workbench.shadow.occlusion import Shader
 
 __all__ = ["solve_direct", "solve_exchange", "solve_matrix"]
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 COLUMNS_A_STEP = 32
 SOLVED_TO, MOST_STEPS = 1e-14, 2000
 """Relative residual at which the linear equations count as solved, and most steps towards it."""
 COVERED = 0.01
 """Share of an element of a closed scene that must see nothing to count as covered (the floor under a box)."""
+ROWS_A_STEP = 256
+"""Rows of a matrix that are worked on at once, where its size must not be needed twice."""
 
 
 def solve_direct(solution: Solution, bundles: ColumnFinder, *, closed: bool, progress: Progress | None = None) -> None:
@@ -67,6 +69,10 @@ def solve_direct(solution: Solution, bundles: ColumnFinder, *, closed: bool, pro
 def _told_apart(seen: FloatArray, area: FloatArray, closed: bool) -> FloatArray:
     """The radiosity on which errors of form factors act: in rows that sum to 1 its mean counts for nothing."""
     return seen - (area @ seen) / area.sum() if closed else seen
+
+
+def _row_blocks(rows: int) -> list[slice]:
+    return [slice(first, min(first + ROWS_A_STEP, rows)) for first in range(0, rows, ROWS_A_STEP)]
 
 
 def _bounce(exchange: FloatArray, area: FloatArray, rho: FloatArray, before: FloatArray) -> FloatArray:
@@ -114,7 +120,7 @@ def solve_exchange(
     solution : Solution
         Changed in place: what is unshot is shot, with all that follows from it.
     exchange : (n, n) float
-        Symmetric exchange areas A_i F_ij. [scene lengths squared]
+        Symmetric exchange areas A_i F_ij; in a closed scene balanced in place. [scene lengths squared]
     sums, doubt : (n,) float
         Row sums of the form factors as found, and their errors.
     closed : bool
@@ -143,18 +149,20 @@ def solve_exchange(
         covered = 1.0 - sums > np.maximum(doubt, COVERED)
         visible[covered] = sums[covered]
         x = close_rows(exchange, area * visible)
-        balanced = exchange * x * x[:, None]
-        record.errors["row_balance_correction"] = float(np.abs(balanced - exchange).max() / scale)
+        change = 0.0
+        for rows in _row_blocks(n):
+            before = exchange[rows].copy()
+            exchange[rows] *= x[rows, None] * x
+            change = max(change, float(np.abs(exchange[rows] - before).max()))
+        record.errors["row_balance_correction"] = change / scale
         record.results["covered_elements"] = int(covered.sum())
-        exchange = balanced
     share = np.where(visible > 0, visible, 1.0)[:, None]
-    factor = exchange / (area[:, None] * share)
     # Light that came from outside or from lamps fell on the visible part, too; emission leaves the whole.
     unshot = solution.unshot
     own = np.minimum(mesh.emission, unshot)
     before = own + (unshot - own) / share
     seen = _bounce(exchange, area[:, None] * share, mesh.reflectance, before)
-    arriving = visible[:, None] * (factor @ seen)
+    arriving = (exchange @ seen) / area[:, None]
     reflected = mesh.reflectance * arriving
     book = solution.book
     shot, received = area @ (unshot + reflected), area @ arriving
@@ -171,12 +179,21 @@ def solve_exchange(
     return seen
 
 
+def _summed(matrix: FloatArray, start: IntArray) -> FloatArray:
+    """Entries of a square matrix added up over groups of neighbouring rows and columns."""
+    out = np.empty((len(start) - 1, len(start) - 1))
+    for k in range(len(start) - 1):
+        out[k] = np.add.reduceat(matrix[start[k] : start[k + 1]].sum(axis=0), start[:-1])
+    return out
+
+
 def solve_matrix(
     solution: Solution,
-    geometry: Geometry,
+    shader: Shader,
     *,
     error: float,
     closed: bool,
+    coarse: Solution | None = None,
     workers: int = 1,
     seed: int = 0,
     progress: Progress | None = None,
@@ -187,6 +204,20 @@ def solve_matrix(
     (:mod:`radiosity.solvers.lamps`).  Pairs of the rest are settled in groups
     (:func:`radiosity.form_factors.matrix.exchange_areas`) to ``error``, the mean over the rows of the
     sum of their errors.  Ctrl-C before the end leaves the emission alone as the solution.
+
+    Parameters
+    ----------
+    solution : Solution
+        Before anything is shot; changed in place.
+    shader : Shader
+        Over the scene's geometry.
+    error, workers, seed, progress
+        As in :func:`radiosity.solvers.solve.solve`.
+    closed : bool
+        Whether the elements are an enclosure.
+    coarse : Solution, optional
+        The same scene, nothing shot, on a mesh whose elements are the patches of the solution's: solved too,
+        from the same exchange areas added up.  What differs is what the mesh leaves.
     """
     mesh, record = solution.mesh, solution.record
     n, start = mesh.element_count, time.perf_counter()
@@ -197,37 +228,43 @@ def solve_matrix(
             progress(ProgressEvent(0, 1.0 - done, 0.0, time.perf_counter() - start, "form factors"))
 
     square = np.zeros((2, mesh.bands))
-    lamps = lamps_of_scene(solution.scene, geometry)
+    lamps = lamps_of_scene(solution.scene, shader.geometry)
     try:
         report(0.0)
         if lamps:
             with record.stage("light of lamps"):
-                light = lamp_irradiance(
-                    mesh,
-                    Shader(geometry, workers),
-                    lamps,
-                    record.counters,
-                    error=error,
-                    closed=closed,
-                    seed=seed,
-                )
+                light = lamp_irradiance(mesh, shader, lamps, record.counters, error=error, closed=closed, seed=seed)
         with record.stage("form factors"):
             exchange, spread = exchange_areas(
-                mesh, geometry, record, error=error, workers=workers, seed=seed, progress=report
+                mesh, shader.geometry, record, error=error, workers=workers, seed=seed, progress=report
             )
     except KeyboardInterrupt:
         return
     with record.stage("solve"):
-        if lamps:
-            sent = mesh.element_area[light.elements] @ mesh.emission[light.elements]
-            solution.unshot[light.elements] -= mesh.emission[light.elements]
-            receive(solution, light.irradiance, sent)
-            square[0] += light.mean_square
         area = mesh.element_area
-        doubt = spread.sum(axis=1) / area
-        seen = solve_exchange(solution, exchange, exchange.sum(axis=1) / area, doubt, closed=closed)
-        variance = (spread / area[:, None]) ** 2 @ _told_apart(seen, area, closed) ** 2
-        square[0] += area @ variance / area.sum()
+        if lamps:
+            _receive_lamps(solution, light.irradiance, light.elements)
+            square[0] += light.mean_square
+        sums, doubt = exchange.sum(axis=1) / area, spread.sum(axis=1, dtype=np.float64) / area
+        if coarse is not None:
+            if lamps:
+                emits = np.flatnonzero(coarse.mesh.emission.any(axis=1))
+                _receive_lamps(coarse, mesh.patch_mean(light.irradiance), emits)
+            row_sums, doubts = (mesh.patch_mean(each[:, None])[:, 0] for each in (sums, doubt))
+            solve_exchange(coarse, _summed(exchange, mesh.patch_start), row_sums, doubts, closed=closed)
+        seen = solve_exchange(solution, exchange, sums, doubt, closed=closed)
+        apart = _told_apart(seen, area, closed) ** 2
+        for rows in _row_blocks(n):
+            variance = (spread[rows] / area[rows, None]) ** 2 @ apart
+            square[0] += area[rows] @ variance / area.sum()
     solution.state_irradiance_error(form_factors=square[0], visibility=square[1])
     record.errors["reciprocity"] = 0.0
     record.counters.add(shots=n)
+
+
+def _receive_lamps(solution: Solution, irradiance: FloatArray, elements: IntArray) -> None:
+    """Let the light of lamps (the ``elements``) arrive: what they emit has been shot."""
+    mesh = solution.mesh
+    sent = mesh.element_area[elements] @ mesh.emission[elements]
+    solution.unshot[elements] -= mesh.emission[elements]
+    receive(solution, irradiance, sent)

@@ -18,13 +18,15 @@ from radiosity.solvers.hierarchical import solve_hierarchical
 from radiosity.solvers.incident import incident_irradiance
 from radiosity.solvers.progressive import shoot_until
 from radiosity.solvers.solution import Checkpoint, EnergyBook, Progress, Solution
+from workbench.accel.embree import EmbreeAccelerator
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.memory import require_memory
 from workbench.record import RunRecord
 from workbench.scene.model import Scene
+from workbench.shadow.occlusion import Shader
 
-__all__ = ["solve"]
+__all__ = ["begin", "require_matrix_memory", "solve", "solve_by_matrix", "solve_by_patches"]
 
 METHODS = ("auto", "progressive", "direct", "matrix", "hierarchical")
 BUNDLES: dict[str, Callable[..., ColumnFinder]] = {"receiver": ReceiverBundles, "directional": DirectionalBundles}
@@ -44,6 +46,7 @@ ONE_LEVEL_ELEMENTS = 1600
 
 # Bytes an element costs while a mesh is made and solved, beside its bands.
 _ELEMENT_BYTES = 3000
+_FEWER = "ask for fewer elements or a larger max_edge"
 
 
 def _form_factor_error(elements: int, method: str) -> float:
@@ -104,10 +107,14 @@ def _check(
 def _forecast(scene: Scene, elements: int | None, max_edge: float | None, method: str) -> None:
     """Refuse a mesh or matrix that cannot fit in memory, before it is made."""
     count = float(elements) if elements is not None else float(forecast_elements(scene, max_edge or math.inf))
-    advice = "ask for fewer elements or a larger max_edge"
-    require_memory(count * (_ELEMENT_BYTES + 64 * scene.bands), f"a mesh of {count:.3g} elements", advice)
+    require_memory(count * (_ELEMENT_BYTES + 64 * scene.bands), f"a mesh of {count:.3g} elements", _FEWER)
     if method in FULL:
-        require_memory(40.0 * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", advice)
+        require_matrix_memory(count)
+
+
+def require_matrix_memory(count: float) -> None:
+    """Refuse a full matrix of form factors that cannot fit in memory."""
+    require_memory(40.0 * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", _FEWER)
 
 
 def _note_materials(geometry: Geometry, record: RunRecord) -> None:
@@ -244,6 +251,75 @@ def solve(
     Specular reflection and refraction are left to the picture: their share is absorbed here.  Panes
     (transmittance above 0) dim what is cut exactly and block rays; ``record.choices`` says so.
     """
+    record = begin(
+        scene, method=method, elements=elements, max_edge=max_edge, rays=rays, tolerance=tolerance,
+        form_factor_error=form_factor_error, link_error=link_error, direct_in_mesh=direct_in_mesh, bundles=bundles,
+        workers=workers, seed=seed,
+    )  # fmt: skip
+    elements, link_error, count = (record.settings[name] for name in ("elements", "link_error", "workers"))
+    with record.stage("mesh"):
+        geometry = Geometry.from_scene(scene)
+    if method == "hierarchical":
+        _note_materials(geometry, record)
+        return solve_hierarchical(
+            scene,
+            geometry,
+            record,
+            link_error=link_error,
+            max_elements=elements,
+            max_edge=max_edge,
+            direct_in_mesh=direct_in_mesh,
+            form_factor_error=form_factor_error,
+            tolerance=min(tolerance, 1e-4),
+            workers=count,
+            seed=seed,
+            progress=progress,
+        )
+    with record.stage("mesh"):
+        whole = method in FULL
+        mesh = build_mesh(
+            scene, geometry, elements=elements, max_edge=max_edge, split=1 if whole else 2, cluster=not whole
+        )
+    n = mesh.element_count
+    if method == "auto":
+        method = "direct" if n <= DIRECT_ELEMENTS else "progressive"
+        record.choices["method"] = f"{method}: {n} elements, direct up to {DIRECT_ELEMENTS}"
+    if mesh.patch_count < n and (method in FULL or n <= ONE_LEVEL_ELEMENTS):
+        with record.stage("mesh"):
+            cluster = method not in FULL
+            mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=cluster)
+    _forecast(scene, mesh.element_count, None, method)
+    if method == "matrix":
+        with record.stage("prepare"):
+            shader = Shader(geometry, count)
+        return solve_by_matrix(scene, shader, mesh, record, progress=progress)[0]
+    return solve_by_patches(
+        scene, geometry, mesh, record, method=method, progress=progress, checkpoint=checkpoint, resume=resume
+    )
+
+
+def begin(
+    scene: Scene,
+    *,
+    method: str = "auto",
+    elements: int | None = None,
+    max_edge: float | None = None,
+    rays: int = 16,
+    tolerance: float = 0.01,
+    form_factor_error: float | None = None,
+    link_error: float | None = None,
+    direct_in_mesh: bool = True,
+    bundles: str = "receiver",
+    workers: int | None = None,
+    seed: int = 0,
+) -> RunRecord:
+    """Check the scene and the options of a solve, see :func:`solve`, and forecast its memory.
+
+    Returns
+    -------
+    RunRecord
+        With the settings, defaults filled in.
+    """
     count = workers if workers is not None else len(os.sched_getaffinity(0))
     _check(scene, method, elements, max_edge, rays, tolerance, count)
     if method != "hierarchical":
@@ -260,6 +336,8 @@ def solve(
             f"bundles: found {bundles!r} with method 'hierarchical', which has links of its own;"
             " choose method 'progressive' or 'direct'"
         )
+    if form_factor_error is not None and not 0 < form_factor_error < 1:
+        raise OptionError(f"form_factor_error: found {form_factor_error}, expected a number between 0 and 1")
     _forecast(scene, elements, max_edge, method)
     settings: dict[str, Any] = {
         "scene": scene.name,
@@ -275,70 +353,120 @@ def solve(
         "workers": count,
         "seed": seed,
     }
-    record = RunRecord(command="solve", settings=settings)
-    if form_factor_error is not None and not 0 < form_factor_error < 1:
-        raise OptionError(f"form_factor_error: found {form_factor_error}, expected a number between 0 and 1")
-    with record.stage("mesh"):
-        geometry = Geometry.from_scene(scene)
-    _note_materials(geometry, record)
-    if method == "hierarchical":
-        return solve_hierarchical(
-            scene,
-            geometry,
-            record,
-            link_error=link_error,
-            max_elements=elements,
-            max_edge=max_edge,
-            direct_in_mesh=direct_in_mesh,
-            form_factor_error=form_factor_error,
-            tolerance=min(tolerance, 1e-4),
-            workers=count,
-            seed=seed,
-            progress=progress,
-        )
-    with record.stage("mesh"):
-        mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge)
-    n = mesh.element_count
-    if method == "auto":
-        method = "direct" if n <= DIRECT_ELEMENTS else "progressive"
-        record.choices["method"] = f"{method}: {n} elements, direct up to {DIRECT_ELEMENTS}"
-    if mesh.patch_count < n and (method in FULL or n <= ONE_LEVEL_ELEMENTS):
-        with record.stage("mesh"):
-            cluster = method not in FULL
-            mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=cluster)
-        n = mesh.element_count
-    _forecast(scene, n, None, method)
-    error = form_factor_error if form_factor_error is not None else _form_factor_error(n, method)
+    return RunRecord(command="solve", settings=settings)
+
+
+def _accuracy(record: RunRecord, elements: int, method: str) -> float:
+    """Relative error of form factors: as asked, or by the number of elements."""
+    asked = record.settings["form_factor_error"]
+    error = float(asked) if asked is not None else _form_factor_error(elements, method)
     record.choices["form_factor_error"] = f"{error:g}"
+    return error
+
+
+def _sum_up(solution: Solution) -> None:
+    """Write into the record what a solve was of."""
+    mesh, record = solution.mesh, solution.record
+    record.errors["facet_error"] = mesh.facet_error
+    record.results.update(
+        elements=mesh.element_count,
+        patches=mesh.patch_count,
+        energy_book=solution.book.as_dict(),
+        stopped=solution.stopped,
+    )
+
+
+def solve_by_matrix(
+    scene: Scene,
+    shader: Shader,
+    mesh: PatchMesh,
+    record: RunRecord,
+    *,
+    coarse_mesh: PatchMesh | None = None,
+    progress: Progress | None = None,
+) -> tuple[Solution, Solution | None]:
+    """Solve on a mesh with all form factors at once, and on its patches with the same ones.
+
+    Parameters
+    ----------
+    scene : Scene
+    shader : Shader
+        Over its geometry.
+    mesh : PatchMesh
+        Of single polygons: no clusters of facets.
+    record : RunRecord
+        From :func:`begin`, which checked the options; its settings are read.
+    coarse_mesh : PatchMesh, optional
+        Its elements are the patches of ``mesh``.
+    progress : callable, optional
+        As in :func:`solve`.
+
+    Returns
+    -------
+    solution, coarse : Solution
+        On either mesh; ``coarse`` is None without ``coarse_mesh``.
+    """
+    _note_materials(shader.geometry, record)
+    settings = record.settings
+    error = _accuracy(record, mesh.element_count, "matrix")
+    tracer = EmbreeAccelerator(shader.geometry)
+    with record.stage("incident light"):
+        incident = incident_irradiance(scene, mesh, tracer, seed=settings["seed"], shader=shader)
+    record.counters.merge(tracer.counters)
+    solution = _start(scene, mesh, incident, record)
+    coarse = None
+    if coarse_mesh is not None:
+        coarse = _start(scene, coarse_mesh, mesh.patch_mean(incident), RunRecord("solve", dict(settings)))
+    solve_matrix(
+        solution,
+        shader,
+        error=error,
+        closed=scene.closed,
+        coarse=coarse,
+        workers=settings["workers"],
+        seed=settings["seed"],
+        progress=progress,
+    )
+    _sum_up(solution)
+    return solution, coarse
+
+
+def solve_by_patches(
+    scene: Scene,
+    geometry: Geometry,
+    mesh: PatchMesh,
+    record: RunRecord,
+    *,
+    method: str,
+    progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
+    resume: Solution | None = None,
+) -> Solution:
+    """Solve on a mesh, ``progressive`` or ``direct``, with form factors found patch by patch.
+
+    Arguments as in :func:`solve_by_matrix` and :func:`solve`.
+    """
+    _note_materials(geometry, record)
+    settings = record.settings
+    error = _accuracy(record, mesh.element_count, method)
     with record.stage("prepare"):
-        finder = BUNDLES[bundles](geometry, mesh, _settings(error, rays, seed, mesh.patch_count), count)
+        links = _settings(error, settings["rays"], settings["seed"], mesh.patch_count)
+        finder = BUNDLES[settings["bundles"]](geometry, mesh, links, settings["workers"])
     try:
-        if resume is None or method in FULL:
+        if resume is None or method == "direct":
             # A full solve has no half-way state to go on from.
             with record.stage("incident light"):
-                incident = incident_irradiance(scene, mesh, finder.accelerator, seed=seed)
+                incident = incident_irradiance(scene, mesh, finder.accelerator, seed=settings["seed"])
             solution = _start(scene, mesh, incident, record)
             record.counters.merge(finder.accelerator.counters)
         else:
             solution = _resumed(scene, mesh, resume, record)
         if method == "direct":
             solve_direct(solution, finder, closed=scene.closed, progress=progress)
-        elif method == "matrix":
-            solve_matrix(
-                solution,
-                geometry,
-                error=error,
-                closed=scene.closed,
-                workers=count,
-                seed=seed,
-                progress=progress,
-            )
         else:
+            tolerance = settings["tolerance"]
             shoot_until(solution, finder, tolerance=tolerance, progress=progress, checkpoint=checkpoint)
     finally:
         finder.close()
-    record.errors["facet_error"] = mesh.facet_error
-    record.results.update(
-        elements=n, patches=mesh.patch_count, energy_book=solution.book.as_dict(), stopped=solution.stopped
-    )
+    _sum_up(solution)
     return solution

@@ -10,9 +10,13 @@ from accuracy_cases import accuracy_cases
 from radiosity_scenes import cube_with_emitter
 
 import radiosity
-from radiosity.accuracy import surface_points
+from radiosity.accuracy import _patches_as_elements, surface_points
+from radiosity.patches import build_mesh
+from radiosity.solvers.solve import begin, solve_by_matrix
 from workbench.errors import OptionError
+from workbench.geometry.flat import Geometry
 from workbench.scene.library import unit_cube
+from workbench.shadow.occlusion import Shader
 
 CASES = {case.name: case for case in accuracy_cases()}
 NEGLIGIBLE = 0.01
@@ -37,15 +41,30 @@ def test_a_smaller_error_needs_a_finer_mesh():
 
 
 def test_parts_add_up_and_levels_tell_the_story():
-    record = radiosity.solve(cube_with_emitter(0.5, 0.5), error=0.02).record
+    record = radiosity.solve(cube_with_emitter(0.5, 0.5), error=0.0005).record
     estimate = record.errors["estimate"]
     parts = ("meshing", "form_factors", "visibility", "convergence")
     assert estimate["total"] == pytest.approx(sum(estimate[name] for name in parts), rel=1e-12)
     levels = record.results["levels"]
-    assert levels[0]["difference"] is None and math.isinf(levels[0]["total"])
+    assert len(levels) > 1 and all(level["coarse_elements"] < level["elements"] for level in levels)
     assert [level["elements"] for level in levels] == sorted({level["elements"] for level in levels})
-    assert levels[-1]["total"] == estimate["total"] <= 0.02
-    assert record.settings["error"] == 0.02 and "below the target" in record.choices["stop"]
+    assert levels[-1]["total"] == estimate["total"] <= 0.0005
+    assert record.settings["error"] == 0.0005 and "below the target" in record.choices["stop"]
+
+
+def test_the_patches_of_a_mesh_are_solved_as_a_mesh_of_their_own_would_be():
+    scene = cube_with_emitter(0.5, 0.9)
+    record = begin(scene, method="matrix", max_edge=0.25, form_factor_error=1e-4)
+    shader = Shader(Geometry.from_scene(scene))
+    mesh = build_mesh(scene, shader.geometry, max_edge=0.25, split=2, cluster=False)
+    patches = _patches_as_elements(mesh)
+    fine, coarse = solve_by_matrix(scene, shader, mesh, record, coarse_mesh=patches)
+    alone = radiosity.solve(scene, method="matrix", max_edge=0.5, form_factor_error=1e-4)
+    for name in ("element_area", "element_centroid", "element_normal", "element_size", "element_polygon"):
+        np.testing.assert_allclose(getattr(patches, name), getattr(alone.mesh, name), atol=1e-12)
+    assert fine.mesh.element_count == 96 and coarse.mesh.element_count == 24
+    np.testing.assert_allclose(coarse.element_irradiance, alone.element_irradiance, rtol=3e-4)
+    assert abs(coarse.record.errors["energy_imbalance"]) < 1e-12
 
 
 def test_budget_ends_the_refinement_and_says_what_was_reached():
