@@ -5,7 +5,6 @@ Only ``click`` is imported at the top; everything heavy is imported when the com
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,9 +25,6 @@ __all__ = ["irradiance"]
 
 CHUNK = 65_536
 """Points gathered at once: memory stays bounded however many there are."""
-SOLVE_SHARE = 0.8
-"""Share of the wanted error for the solve; sampling may take what its estimate leaves of the square, and at least:"""
-LEAST_SHARE = 0.6
 UNSHOT_SHARE = 0.2
 """Share of it for light that a solve of given elements has not shot."""
 
@@ -84,6 +80,9 @@ def irradiance(
     standard error, in W/m2.  The standard error is what sampling leaves; the solution's own error is
     printed, and stands in the record.
     """
+    from radiosity.startup import load_numba
+
+    load_numba()
     import workbench
     from radiosity.points_file import read_sensor_points
     from workbench.record import RunRecord
@@ -141,6 +140,7 @@ def _solution(
 ) -> Solution:
     """The solution to gather from: a saved one, or one solved now."""
     import radiosity
+    from radiosity.sensors import SOLVE_SHARE
 
     if directory is not None:
         with record.stage("read"):
@@ -171,15 +171,12 @@ def _gather(
     """The estimates of all points, in chunks."""
     from tqdm import tqdm
 
-    from radiosity.sensors import Gatherer
+    from radiosity.sensors import Gatherer, left_for_sampling
 
     with record.stage("prepare"):
         gatherer = Gatherer(solution, workers=workers, seed=seed)
     parts = []
-    # The two errors are independent.  Of a given solution nothing may be known: half of the square for each then.
-    estimate = solution.record.errors.get("estimate", {}).get("total", math.sqrt(0.5) * error)
-    share = math.sqrt(max(error**2 - estimate**2, (LEAST_SHARE * error) ** 2))
-    record.settings["sampling_error"] = share
+    share = record.settings["sampling_error"] = left_for_sampling(solution, error)
     with record.stage("gather"), tqdm(total=len(rows), unit="points", disable=None, leave=False) as bar:
         for first in range(0, len(rows), CHUNK):
             some = rows[first : first + CHUNK]

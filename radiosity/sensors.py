@@ -33,13 +33,16 @@ from workbench.shadow.lights import Sender, SphereLight, lights_of_scene
 from workbench.shadow.occlusion import ROUNDING, Shader
 from workbench.shadow.sky import SkyLight
 
-__all__ = ["Bundled", "Direct", "Gatherer", "IrradianceEstimate"]
+__all__ = ["Bundled", "Direct", "Gatherer", "IrradianceEstimate", "left_for_sampling"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MOST_LIGHTS = 64
 """Emitting polygons of one surface that are each asked as a light; those of a larger mesh are gathered."""
+SOLVE_SHARE = 0.8
+"""Share of a wanted error for the solve; sampling may take what its estimate leaves of the square, and at least:"""
+LEAST_SHARE = 0.6
 PILOT_RAYS = (16, 64)
 """Rays a point by which the number of rays is chosen: as many as 0.03 of error needs, within these."""
 PILOT_ERROR = 0.03
@@ -600,6 +603,15 @@ class Gatherer:
         true = mesh.reflectance[e] * (lit.irradiance + indirect + from_sky) + own
         read = np.einsum("nbk,nk->nb", self._linear[e, :, :3], place) + self._linear[e, :, 3]
         np.add.at(bundle.fix, (rows, run), share[:, None] * (true - np.maximum(read, 0.0)))
+
+
+def left_for_sampling(solution: Solution, error: float) -> float:
+    """What of a wanted error at points is left for sampling, as much as the solution states to be off.
+
+    The two are independent, so their squares add up; of a solution that states nothing half is supposed.
+    """
+    estimate = solution.record.errors.get("estimate", {}).get("total", math.sqrt(0.5) * error)
+    return math.sqrt(max(error**2 - estimate**2, (LEAST_SHARE * error) ** 2))
 
 
 def _power_of_two(count: int) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import json
 import os
 import platform
@@ -12,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ _LIBRARIES = ("radiosity-workbench", "numpy", "scipy", "numba", "embreex", "trim
 
 @functools.cache
 def _versions() -> dict[str, str]:
+    import importlib.metadata
+
     found = {"python": platform.python_version()}
     for name in _LIBRARIES:
         try:
@@ -98,8 +100,17 @@ class RunRecord:
     errors: dict[str, Any] = field(default_factory=dict)
     choices: dict[str, str] = field(default_factory=dict)
     results: dict[str, Any] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=lambda: dict(_versions()))
-    machine: dict[str, Any] = field(default_factory=_machine)
+
+    # Found when asked for: not every run writes its record, and these take some hundredths of a second.
+    @cached_property
+    def versions(self) -> dict[str, str]:
+        """Versions of Python and of the libraries."""
+        return dict(_versions())
+
+    @cached_property
+    def machine(self) -> dict[str, Any]:
+        """Processor, number of cores and system."""
+        return _machine()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
@@ -856,9 +855,8 @@ def exchange_areas(
     engine = _Engine(_Elements.of_mesh(mesh), geometry, _Care.for_error(error, n, loose=False), seed)
     require_memory(3.0 * DENSE_ENTRY * n**2, f"a matrix of {n} x {n} form factors", "ask for fewer elements")
     engine.prepare_rays()
-    exchange, spread = _all_exchanges(engine, engine.pieces.owner, mesh.element_area, workers, record, progress)
-    whole = [part if isinstance(part, np.ndarray) else part.toarray() for part in (exchange, spread)]
-    return whole[0], whole[1]
+    found = _all_exchanges(engine, engine.pieces.owner, mesh.element_area, workers, record, progress, dense=True)
+    return found
 
 
 def _all_exchanges(
@@ -869,8 +867,10 @@ def _all_exchanges(
     record: RunRecord,
     progress: Progress | None,
     error: float = math.inf,
+    *,
+    dense: bool = False,
 ) -> tuple[Matrix, Matrix]:
-    """Symmetric exchange areas between rows and their errors, dense or sparse, whichever is smaller.
+    """Symmetric exchange areas between rows and their errors, ``dense`` or sparse, whichever is smaller.
 
     Where the stated error is above ``error``, the pairs that make it are refined.
     """
@@ -907,7 +907,7 @@ def _all_exchanges(
         if rows < n:
             r, c, value, doubt = (np.concatenate([part[k] for part in parts]) for k in range(4))
             parts = [_merged(r, c, value, doubt, rows)]
-        return _symmetric(parts, rows, pool.map)
+        return _symmetric(parts, rows, pool.map, dense)
 
 
 def _merged(
@@ -962,19 +962,21 @@ def _blocks(rows: int) -> list[tuple[int, int]]:
     return [(first, min(first + BLOCK_ROWS, rows)) for first in range(0, rows, BLOCK_ROWS)]
 
 
-def _symmetric(parts: list[tuple[Any, ...]], rows: int, each: Callable[..., Any]) -> tuple[Matrix, Matrix]:
+def _symmetric(parts: list[tuple[Any, ...]], rows: int, each: Callable[..., Any], dense: bool) -> tuple[Matrix, Matrix]:
     """The whole matrices of distinct pairs (r, c, value, error), which are given up on the way."""
     for r, c, value, error in parts:
         # Pieces of one row that see each other do so both ways.
         value[r == c] *= 2.0
         error[r == c] *= math.sqrt(2.0)
     count = sum(2 * len(r) - int((r == c).sum()) for r, c, _, _ in parts)
-    if SPARSE_ENTRY * count >= DENSE_ENTRY * rows**2:
-        dense, dense_error = np.zeros((rows, rows)), np.zeros((rows, rows), dtype=np.float32)
+    if dense or SPARSE_ENTRY * count >= DENSE_ENTRY * rows**2:
+        whole, whole_error = np.zeros((rows, rows)), np.zeros((rows, rows), dtype=np.float32)
         while parts:
             r, c, value, error = parts.pop()
-            _scatter(r, c, value, error, dense, dense_error)
-        return dense, dense_error
+            _scatter(r, c, value, error, whole, whole_error)
+        return whole, whole_error
+    import scipy.sparse  # takes longer than a small solve, for matrices that are sparse only
+
     start = np.zeros(rows + 1, dtype=np.int32 if count < 2**31 else np.int64)
     for part in parts:
         _count_rows(part[0], part[1], start)

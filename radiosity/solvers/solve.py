@@ -14,7 +14,6 @@ from radiosity.form_factors.bundle import ColumnFinder, LinkSettings, ReceiverBu
 from radiosity.form_factors.directional import DirectionalBundles
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
 from radiosity.solvers.direct import solve_direct, solve_matrix
-from radiosity.solvers.hierarchical import solve_hierarchical
 from radiosity.solvers.incident import incident_irradiance
 from radiosity.solvers.progressive import shoot_until
 from radiosity.solvers.solution import Checkpoint, EnergyBook, Progress, Solution
@@ -261,6 +260,8 @@ def solve(
         geometry = Geometry.from_scene(scene)
     if method == "hierarchical":
         _note_materials(geometry, record)
+        from radiosity.solvers.hierarchical import solve_hierarchical  # kernels that others need not load
+
         return solve_hierarchical(
             scene,
             geometry,
