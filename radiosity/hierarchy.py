@@ -324,6 +324,115 @@ def _split_cells(nodes, tree, node, piece):
 
 
 @njit(nogil=True, cache=True)
+def _holds(node, tree, x, y, z, tolerance):
+    """Whether a flat node of one piece holds a point of its plane."""
+    p = tree.piece0[node]
+    a, b = tree.starts[p], tree.starts[p + 1]
+    nx, ny, nz = tree.normal[node, 0], tree.normal[node, 1], tree.normal[node, 2]
+    last = b - 1
+    for i in range(a, b):
+        ex, ey, ez = (
+            tree.corners[i, 0] - tree.corners[last, 0],
+            tree.corners[i, 1] - tree.corners[last, 1],
+            tree.corners[i, 2] - tree.corners[last, 2],
+        )
+        px, py, pz = x - tree.corners[last, 0], y - tree.corners[last, 1], z - tree.corners[last, 2]
+        last = i
+        inside = nx * (ey * pz - ez * py) + ny * (ez * px - ex * pz) + nz * (ex * py - ey * px)
+        if inside < -tolerance * math.sqrt(ex * ex + ey * ey + ez * ez):
+            return False
+    return True
+
+
+@njit(nogil=True, cache=True)
+def _leaf_beyond(node, tree, x, y, z, tolerance):
+    """The leaf of the same polygon that holds a point outside ``node``, -1 if there is none."""
+    at = node
+    while True:
+        parent = tree.parent[at]
+        if parent < 0 or tree.flat[parent] == 0:
+            return -1
+        # Of what is above, the first with a part that holds the point.
+        found = -1
+        for k in range(tree.child[parent], tree.child[parent] + tree.children[parent]):
+            if k != at and _holds(k, tree, x, y, z, tolerance):
+                found = k
+                break
+        at = parent
+        if found >= 0:
+            at = found
+            break
+    while tree.opened[at] == 1:
+        found = -1
+        for k in range(tree.child[at], tree.child[at] + tree.children[at]):
+            if _holds(k, tree, x, y, z, tolerance):
+                found = k
+                break
+        if found < 0:
+            return -1
+        at = found
+    return at
+
+
+@njit(nogil=True, cache=True)
+def _coarser_neighbours(nodes, tree, blocked, found):
+    """Leaves that must be opened before ``nodes`` are, or edges would meet more than two of a neighbour's.
+
+    ``blocked`` tells which nodes have any.  Returns the number of entries of ``found``, which may repeat.
+    """
+    count = 0
+    for i in range(nodes.shape[0]):
+        n = nodes[i]
+        blocked[i] = False
+        if tree.flat[n] == 0 or tree.piece1[n] - tree.piece0[n] != 1:
+            continue
+        a, b = tree.starts[tree.piece0[n]], tree.starts[tree.piece0[n] + 1]
+        nx, ny, nz = tree.normal[n, 0], tree.normal[n, 1], tree.normal[n, 2]
+        last = b - 1
+        for k in range(a, b):
+            px, py, pz = tree.corners[last, 0], tree.corners[last, 1], tree.corners[last, 2]
+            ex, ey, ez = tree.corners[k, 0] - px, tree.corners[k, 1] - py, tree.corners[k, 2] - pz
+            last = k
+            length = math.sqrt(ex * ex + ey * ey + ez * ez)
+            if length == 0.0:
+                continue
+            # A step outward from the middle of the edge; corners run counter-clockwise about the normal.
+            step = 1e-5
+            x = px + 0.5 * ex + step * (ey * nz - ez * ny)
+            y = py + 0.5 * ey + step * (ez * nx - ex * nz)
+            z = pz + 0.5 * ez + step * (ex * ny - ey * nx)
+            other = _leaf_beyond(n, tree, x, y, z, 1e-9 * length)
+            if other < 0:
+                continue
+            # The neighbour's edge there is the one that runs closest to the point.
+            p = tree.piece0[other]
+            before = tree.starts[p + 1] - 1
+            best, its = math.inf, 0.0
+            for c in range(tree.starts[p], tree.starts[p + 1]):
+                fx, fy, fz = (
+                    tree.corners[c, 0] - tree.corners[before, 0],
+                    tree.corners[c, 1] - tree.corners[before, 1],
+                    tree.corners[c, 2] - tree.corners[before, 2],
+                )
+                qx, qy, qz = (
+                    x - tree.corners[before, 0],
+                    y - tree.corners[before, 1],
+                    z - tree.corners[before, 2],
+                )
+                before = c
+                side = math.sqrt(fx * fx + fy * fy + fz * fz)
+                cx, cy, cz = fy * qz - fz * qy, fz * qx - fx * qz, fx * qy - fy * qx
+                away = math.sqrt(cx * cx + cy * cy + cz * cz) / side
+                if away < best:
+                    best, its = away, side
+            if its > 1.001 * length:
+                blocked[i] = True
+                found[count] = other
+                count += 1
+    return count
+
+
+@njit(nogil=True, cache=True)
 def _leaves(tree, found):
     """Nodes that are not opened below opened ones, in the order of the tree; their number."""
     stack = np.empty(4096, dtype=np.int64)
@@ -591,6 +700,51 @@ class Hierarchy:
         tree = self.arrays
         tree.opened[nodes] = 1
         self.leaf_count += int(tree.children[nodes].sum()) - len(nodes)
+
+    def open_balanced(self, nodes: IntArray, room: float = math.inf) -> NDArray[np.bool_]:
+        """Open leaves (distinct), those first that may be taken from; keeps the quadtree of each polygon balanced.
+
+        Balanced 2:1 (B. Von Herzen and A. Barr, "Accurate triangulations of deformed, intersecting surfaces",
+        SIGGRAPH 1987): an edge meets at most two of a neighbour's.  Neighbours are opened as that asks.
+
+        Parameters
+        ----------
+        nodes : (k,) int
+            Leaves, the most wanted first.
+        room : float
+            Most leaves that may be added.
+
+        Returns
+        -------
+        (k,) bool
+            Which were opened: all, if there is room.
+        """
+        limit = self.leaf_count + room
+        while True:
+            # What must be opened before what: a layer waits for the one above it.
+            layers = [nodes[self.arrays.opened[nodes] == 0]]
+            seen = layers[0]
+            while len(layers[-1]):
+                layers.append(np.setdiff1d(self._blockers(layers[-1])[1], seen))
+                seen = np.concatenate([seen, layers[-1]])
+            count = self.leaf_count
+            for layer in reversed(layers[:-1]):
+                self._open_within(layer[~self._blockers(layer)[0]], limit)
+            if self.leaf_count == count:
+                # Pieces round a hole may each wait for the next one.
+                self._open_within(layers[0], limit)
+                return self.arrays.opened[nodes] == 1
+
+    def _open_within(self, nodes: IntArray, limit: float) -> None:
+        """Open as many of ``nodes`` as leave no more leaves than ``limit``."""
+        tree = self.arrays
+        parts = np.where(tree.children[nodes] > 0, tree.children[nodes], 4)
+        self.open(nodes[np.cumsum(parts - 1) <= limit - self.leaf_count])
+
+    def _blockers(self, nodes: IntArray) -> tuple[NDArray[np.bool_], IntArray]:
+        """Whether each of ``nodes`` has neighbours to be opened before it, and these (distinct)."""
+        blocked, found = np.zeros(len(nodes), dtype=bool), np.empty(4 * len(nodes), dtype=np.int64)
+        return blocked, np.unique(found[: _coarser_neighbours(nodes, self.arrays, blocked, found)])
 
     def leaves(self) -> IntArray:
         """The leaves, surface by surface, within one in the order of the tree."""

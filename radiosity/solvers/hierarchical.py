@@ -325,8 +325,10 @@ class _Solver:
         """Let new nodes have what their parents have."""
         n, old = self.tree.node_count, len(self.bright)
         if n > old:
-            parent = self.tree.arrays.parent[old:n]
-            # Parents come first: a cell's parent may itself be new, but never within one call of ``open``.
+            # Nodes of a parent that is itself new have what the last old one above them has.
+            parent = self.tree.arrays.parent[old:n].copy()
+            while (new := np.flatnonzero(parent >= old)).size:
+                parent[new] = self.tree.arrays.parent[parent[new]]
             self.bright = np.concatenate([self.bright, self.bright[parent]])
             self.received = np.concatenate([self.received, self.received[parent]])
             self.uneven = np.concatenate([self.uneven, np.zeros(n - old)])
@@ -453,19 +455,17 @@ class _Solver:
         ends = np.where(verdict == 1, pairs.a, pairs.b)[chosen]
         refused = np.zeros(len(pairs), dtype=bool)
         closed = arrays.opened[ends] == 0
-        nodes, place = np.unique(ends[closed], return_inverse=True)
+        nodes, place = np.unique(ends[closed].astype(np.int64), return_inverse=True)
         if self.max_elements is not None and len(nodes):
             # Where elements are counted, those with the largest need come first.
             largest = np.zeros(len(nodes))
             np.maximum.at(largest, place, need[chosen[closed]])
-            parts = np.where(arrays.children[nodes] > 0, arrays.children[nodes], 4)
             order = np.argsort(-largest, kind="stable")
-            room = self.max_elements - self.tree.leaf_count
             allowed = np.zeros(len(nodes), dtype=bool)
-            allowed[order] = np.cumsum(parts[order] - 1) <= room
+            allowed[order] = self.tree.open_balanced(nodes[order], self.max_elements - self.tree.leaf_count)
             refused[chosen[closed]] = ~allowed[place]
-            nodes = nodes[allowed]
-        self.tree.open(nodes.astype(np.int64))
+        else:
+            self.tree.open_balanced(nodes)
         self._grown()
         arrays = self.tree.arrays
         chosen = np.flatnonzero((verdict > 0) & ~refused)
@@ -557,7 +557,7 @@ class _Solver:
             require_memory(
                 float(len(leaves) * 2000), f"{4 * len(chosen):.3g} more elements", "ask for a larger max_edge"
             )
-            self.tree.open(chosen)
+            self.tree.open_balanced(chosen)
             self._grown()
 
     def incident(self, nodes: IntArray) -> FloatArray:
@@ -630,17 +630,19 @@ class _Solver:
             spread = self._from_outside("spread", incident_spread, fresh)
             need = (spread / unit).max(axis=1) * self.weight[fresh]
             chosen = np.flatnonzero((need > error) & self.can_split[fresh])
+            room = math.inf
             if self.max_elements is not None:
-                chosen = chosen[np.argsort(-need[chosen], kind="stable")]
-                room = (self.max_elements - self.tree.leaf_count) // 3
-                chosen = np.sort(chosen[: max(room, 0)])
-            if not len(chosen):
+                room = float(self.max_elements - self.tree.leaf_count)
+            nodes = fresh[chosen[np.argsort(-need[chosen], kind="stable")]]
+            nodes = nodes[self.tree.open_balanced(nodes, room)]
+            if not len(nodes):
                 return
-            nodes = fresh[chosen]
-            self.tree.open(nodes)
+            before = len(self.bright)
             self._grown()
             child, counts = self.tree.arrays.child[nodes], self.tree.arrays.children[nodes]
-            fresh = np.repeat(child - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+            parts = np.repeat(child - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+            fresh = np.union1d(parts, np.arange(before, self.tree.node_count))
+            fresh = fresh[self.tree.arrays.opened[fresh] == 0]
 
     def waiting(self) -> bool:
         """Whether there are links that were dark when last looked at and are not now."""

@@ -86,6 +86,67 @@ def test_leaves_tile_the_surfaces_however_they_are_opened(scene):
     assert (arrays.parent[1:n] < np.arange(1, n)).all()
 
 
+def hanging_corners(mesh):
+    """Most corners of others that lie inside one edge of an element, over all edges of one polygon's elements."""
+    most = 0
+    for polygon in np.unique(mesh.element_polygon[mesh.element_polygon >= 0]):
+        pieces = np.flatnonzero(mesh.element_polygon[mesh.piece_element] == polygon)
+        rings = [mesh.corners[mesh.piece_start[p] : mesh.piece_start[p + 1]] for p in pieces]
+        corners = np.unique(np.round(np.concatenate(rings), 9), axis=0)
+        for ring in rings:
+            for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+                along = b - a
+                t = (corners - a) @ along / (along @ along)
+                away = np.linalg.norm(corners - a - t[:, None] * along, axis=1)
+                inside = (t > 1e-6) & (t < 1 - 1e-6) & (away < 1e-7)
+                most = max(most, int(inside.sum()))
+    return most
+
+
+@pytest.mark.parametrize("scene", ["cornell-box", "l-room", "triangle"])
+def test_quadtrees_stay_balanced(scene):
+    # However unevenly they are opened, an edge meets at most two edges of a neighbour.
+    if scene == "triangle":
+        triangle = np.array([[0, 0, 0], [1.0, 0, 0], [0.2, 0.8, 0]])
+        loaded = Scene("triangle", (Surface.from_polygons("t", diffuse("t", 0.5, 1.0), [triangle]),), bands=1)
+    else:
+        loaded = workbench.load("cornell-box") if scene == "cornell-box" else l_room(0)
+    geometry = Geometry.from_scene(loaded)
+    rng = np.random.default_rng(3)
+    balanced, free = Hierarchy(loaded, geometry), Hierarchy(loaded, geometry)
+    about = np.array([0.34, 0.4, 0.26]) @ geometry.corners[:3]
+    for tree in (balanced, free):
+        for _ in range(7):
+            leaves = tree.leaves()
+            # Always about one point: the worst there is.
+            near = np.linalg.norm(tree.arrays.centroid[leaves] - about, axis=1)
+            chosen = leaves[np.argsort(near + 0.01 * near.mean() * rng.random(len(near)))[:3]]
+            if tree is balanced:
+                assert tree.open_balanced(chosen).all()
+            else:
+                tree.open(chosen)
+    assert hanging_corners(balanced.mesh(balanced.leaves())) == 1
+    assert hanging_corners(free.mesh(free.leaves())) > 1
+    mesh = balanced.mesh(balanced.leaves())
+    whole = np.diff(geometry.polygon_piece_start) == 1
+    corners = np.diff(geometry.piece_start)[geometry.polygon_piece_start[:-1]]
+    for size in (3, 4):  # quads stay quads
+        own = np.isin(mesh.element_polygon[mesh.piece_element], np.flatnonzero(whole & (corners == size)))
+        assert (np.diff(mesh.piece_start)[own] == size).all()
+
+
+def test_balancing_takes_no_more_room_than_there_is():
+    loaded = workbench.load("cornell-box")
+    tree = Hierarchy(loaded, Geometry.from_scene(loaded))
+    for _ in range(6):
+        leaves = tree.leaves()
+        before = tree.leaf_count
+        tree.open_balanced(leaves[:4], 10)
+        assert before <= tree.leaf_count <= before + 10
+        assert tree.leaf_count == len(tree.leaves())
+    assert hanging_corners(tree.mesh(tree.leaves())) <= 1
+
+
 def test_two_sided_surfaces_have_both_sides_in_the_tree():
     scene = sheet_over_floor(0.4, two_sided=True)
     geometry = Geometry.from_scene(scene)
@@ -158,11 +219,12 @@ def test_it_agrees_with_the_direct_solver_on_the_same_elements(scene):
         link_error=2e-5 if scene == "cube" else 2e-4,
         form_factor_error=1e-3,
     )
-    order, wanted = (np.lexsort(np.round(s.mesh.element_centroid, 6).T) for s in (solution, judge))
-    assert np.allclose(solution.mesh.element_centroid[order], judge.mesh.element_centroid[wanted], atol=1e-9)
-    # Where the box covers a part the judge gives the mean over all of an element, not over its bare part.
-    whole = np.abs(judge.mesh.element_centroid[wanted, 2]) > 1e-9
-    off = (solution.element_irradiance[order, 0] - judge.element_irradiance[wanted, 0])[whole]
+    # The judge's elements on the floor end where the box stands; the hierarchy's have the mean of their bare part.
+    found, exact = (s.element_irradiance[np.abs(s.mesh.element_centroid[:, 2]) > 1e-9, 0] for s in (solution, judge))
+    centre, other = (s.mesh.element_centroid[np.abs(s.mesh.element_centroid[:, 2]) > 1e-9] for s in (solution, judge))
+    order, wanted = (np.lexsort(np.round(c, 6).T) for c in (centre, other))
+    assert np.allclose(centre[order], other[wanted], atol=1e-9)
+    off = found[order] - exact[wanted]
     assert np.sqrt((off**2).mean()) < (1e-4 if scene == "cube" else 0.01) * judge.element_irradiance.mean()
 
 
@@ -257,6 +319,26 @@ def test_failure_mode_5_7_a_dip_between_agreeing_corners_is_found():
     assert solution.element_irradiance[middle, 0].max() < 0.3 * lamp
 
 
+@pytest.mark.parametrize("width", [0.004, 0.02])
+def test_failure_mode_5_7_a_thin_shadow_between_agreeing_corners_is_found(width):
+    # A rod close above the floor: all corners and points of rules lie in the light, on either side of it.
+    base = sheet_over_floor(0.2)
+    y = 0.13
+    ring = np.array([[-1.5, y, 0.01], [1.5, y, 0.01], [1.5, y + width, 0.01], [-1.5, y + width, 0.01]])
+    rod = Surface.from_polygons("rod", replace(diffuse("rod", 0.0), two_sided=True), [ring])
+    scene = replace(base, surfaces=(*base.surfaces[:2], rod))
+    solution = solve(scene, link_error=5e-4)
+    mesh = solution.mesh
+    floor = mesh.element_surface == 0
+    under = floor & (np.abs(mesh.element_centroid[:, 0]) < 0.3)
+    under &= np.abs(mesh.element_centroid[:, 1] - y - width / 2) < width
+    beside = floor & (np.abs(mesh.element_centroid[:, 0]) < 0.3)
+    beside &= np.abs(np.abs(mesh.element_centroid[:, 1] - y) - 0.15) < 0.1
+    assert under.any() and beside.any()
+    # The lamp, 1 by 1 at height 2, hides behind 0.02 at 0.01, and is seen past 0.004 in part.
+    assert solution.element_irradiance[under, 0].min() < 0.8 * solution.element_irradiance[beside, 0].mean()
+
+
 @each_truth("rad/L-room/")
 def test_l_room(name):
     # One element a surface; the L-shaped floor and ceiling are two pieces each.
@@ -281,6 +363,7 @@ def test_leaving_direct_light_to_points_makes_fewer_elements():
 
 def test_the_conforming_export_has_no_t_junctions():
     solution = solve(sheet_over_floor(0.5), link_error=2e-3)
+    assert hanging_corners(solution.mesh) == 1
     poly = solution.to_pyvista(conforming=True)
     assert poly.n_cells > solution.mesh.element_count
     assert poly.area == pytest.approx(solution.mesh.element_area.sum(), rel=1e-6)
