@@ -17,6 +17,7 @@ _LINES = [(silhouette, "line_tiles"), (occlusion, "line_tiles")]
 _CALLERS = {
     (silhouette, "_cross"): [(silhouette, "_look"), *_LINES],
     (silhouette, "_face"): [(silhouette, "_look"), *_LINES],
+    (silhouette, "_inside"): _LINES,
     (silhouette, "_loose_ring"): [(silhouette, "_look"), *_LINES],
     (silhouette, "_reaches"): [(silhouette, "_look"), *_LINES],
     (silhouette, "_blurred"): _LINES,

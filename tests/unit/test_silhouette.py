@@ -110,11 +110,12 @@ def test_lines_agree_with_exact_cuts_past_nasty_polygons(seed, count, far, turne
     ("name", "old", "new"),
     [
         ("_cross", "change = -change", "change = change"),  # falling edges count as rising ones
-        ("_cross", "before[k] += change", "before[k] += 0"),  # what covers the whole line is forgotten
+        ("_cross", "onward[a] += change", "onward[a] += 0"),  # what covers the whole line is forgotten
         ("_face", "1 if off > 0.0", "1 if off < 0.0 and c > 0"),  # the side of a piece
         ("_misses", "max(reach[a, 3], reach[b, 3])", "min(reach[a, 2], reach[b, 2])"),  # how far up an edge is seen
         ("_misses", ">= ring_box[1, 0]", "<= ring_box[0, 0]"),  # the side on which edges may be dropped
         ("_reaches", "max(ax, bx) <= ring_box[0, 0]", "max(ax, bx) <= ring_box[1, 0]"),  # what meets the sender
+        ("_inside", "if not outside:", "if outside:"),  # what of it may lie before the sender
         ("_loose_ring", "-top, 0.0", "-0.9 * top, 0.0"),  # what lies close to the receiver
     ],
 )  # fmt: skip

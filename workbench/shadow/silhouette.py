@@ -261,36 +261,44 @@ def _separated(ring, count, ax, ay, bx, by):
 
 
 @njit(nogil=True, cache=True)
-def _cross(ax, at, bx, bt, change, lines, left, right, before, many, where, steps):
-    """Enter the crossings of an edge with the lines; False when a line has no room.
+def _cross(ends, rise, count, lines, lit_box, left, right, before, onward, many, where, steps):
+    """Enter the crossings of edges with the lines; False when a line has no room.
 
-    ``at`` and ``bt`` count lines: line k lies at k.  ``change`` is the change of layers in +x where
-    the edge runs toward higher lines.
+    ``ends`` (n, 4) are x and y of both ends, y counted in lines: line k lies at k.  ``rise`` (n,) is the
+    change of layers in +x where the edge runs toward higher lines.  What passes left of all that is lit
+    changes the layers that lines begin with: ``before`` of one line, ``onward`` of it and all above it.
     """
-    a = int(min(max(math.ceil(at), 0.0), lines))
-    b = int(min(max(math.ceil(bt), 0.0), lines))
-    if a == b:
-        return True
-    if a > b:
-        a, b = b, a
-        change = -change
-    slope = (bx - ax) / (bt - at)
-    for k in range(a, b):
-        # From the nearer end: the other may be very far away.
-        x = ax + (k - at) * slope if abs(k - at) <= abs(k - bt) else bx + (k - bt) * slope
-        if x >= right[k]:
+    for e in range(count):
+        ax, at, bx, bt = ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3]
+        change = rise[e]
+        a = int(min(max(math.ceil(at), 0.0), lines))
+        b = int(min(max(math.ceil(bt), 0.0), lines))
+        if a == b:
             continue
-        if x <= left[k]:
-            before[k] += change
+        if a > b:
+            a, b = b, a
+            change = -change
+        if ax <= lit_box[0, 0] and bx <= lit_box[0, 0]:
+            onward[a] += change
+            onward[b] -= change
             continue
-        i = many[k]
-        if i == where.shape[1]:
-            return False
-        while i > 0 and where[k, i - 1] > x:
-            where[k, i], steps[k, i] = where[k, i - 1], steps[k, i - 1]
-            i -= 1
-        where[k, i], steps[k, i] = x, change
-        many[k] += 1
+        slope = (bx - ax) / (bt - at)
+        for k in range(a, b):
+            # From the nearer end: the other may be very far away.
+            x = ax + (k - at) * slope if abs(k - at) <= abs(k - bt) else bx + (k - bt) * slope
+            if x >= right[k]:
+                continue
+            if x <= left[k]:
+                before[k] += change
+                continue
+            i = many[k]
+            if i == where.shape[1]:
+                return False
+            while i > 0 and where[k, i - 1] > x:
+                where[k, i], steps[k, i] = where[k, i - 1], steps[k, i - 1]
+                i -= 1
+            where[k, i], steps[k, i] = x, change
+            many[k] += 1
     return True
 
 
@@ -594,6 +602,29 @@ def _reaches(ring, count, ring_box, y0, dy, ax, at, bx, bt):
 
 
 @njit(nogil=True, cache=True)
+def _inside(pieces, table, place, planes, used, slack, out):
+    """Pieces that do not lie wholly outside one of the half-spaces ``n . x >= d``; their number."""
+    starts, _, _, vertex, _, _, _, _ = table
+    kept = 0
+    for p in pieces:
+        outside = False
+        for k in range(used):
+            outside = True
+            for c in range(starts[p], starts[p + 1]):
+                v = vertex[c]
+                reach = planes[k, 0] * place[v, 0] + planes[k, 1] * place[v, 1] + planes[k, 2] * place[v, 2]
+                if reach > planes[k, 3] - slack:
+                    outside = False
+                    break
+            if outside:
+                break
+        if not outside:
+            out[kept] = p
+            kept += 1
+    return kept
+
+
+@njit(nogil=True, cache=True)
 def _loose_ring(p, starts, vertex, place, top, cut, cut2):
     """Corners of a piece between the sender's plane and a height, in ``cut``; their number, -1 if too many."""
     count = starts[p + 1] - starts[p]
@@ -622,7 +653,9 @@ def _look(
     _, _, _, place, plane, height = frame
     group_edge, group_vertex, group_piece, group_plane = group
     edges, settled, spots, unsure = sizes
-    lit, lit_box, cut, cut2, left, right, before, many, where, steps, hidden, over, line, row, facing = scratch
+    lit, lit_box, cut, cut2 = scratch[:4]
+    left, right, before, onward, many, where, steps = scratch[4:11]
+    hidden, over, line, row, facing, active, rise = scratch[11:]
     corners_lit = _clip_ring(ring, nx, ny, nx * px + ny * py + nz * h, lit)
     if corners_lit < 3:
         return STATE_COMPLEX, 0.0, 0.0
@@ -635,31 +668,30 @@ def _look(
             if piece_polygon[group_piece[c]] == own:
                 facing[c] = 0
     lines = fewest
-    meets = fits = True
     while True:
         dy = (lit_box[1, 1] - lit_box[0, 1]) / lines
         y0 = lit_box[0, 1] + offset * dy
         _lay_lines(lit, corners_lit, lines, y0, dy, left, right)
         for k in range(lines):
-            before[k] = many[k] = 0
+            before[k] = many[k] = onward[k] = 0
+        onward[lines] = 0
         _project(group_vertex, spots, px, py, h, y0, dy, lines, over, line, row)
-        for c in range(settled):
+        # Of most edges nothing reaches the lines, or all lies right of what is lit.
+        crossing = 0
+        for c in range(edges):
             a, b = group_edge[c, 0], group_edge[c, 1]
-            if row[a] != row[b]:
-                fits &= _cross(
-                    over[a], line[a], over[b], line[b], group_edge[c, 2], lines, left, right, before, many, where, steps
-                )
-        for c in range(settled, edges):
-            a, b = group_edge[c, 0], group_edge[c, 1]
-            change = (
-                group_edge[c, 2]
-                + group_edge[c, 5] * facing[group_edge[c, 3]]
-                + group_edge[c, 6] * facing[group_edge[c, 4]]
-            )
-            if (change != 0) & (row[a] != row[b]):
-                fits &= _cross(
-                    over[a], line[a], over[b], line[b], change, lines, left, right, before, many, where, steps
-                )
+            if row[a] == row[b] or (over[a] >= lit_box[1, 0] and over[b] >= lit_box[1, 0]):
+                continue
+            change = group_edge[c, 2]
+            if c >= settled:
+                change += group_edge[c, 5] * facing[group_edge[c, 3]] + group_edge[c, 6] * facing[group_edge[c, 4]]
+                if change == 0:
+                    continue
+            active[crossing, 0], active[crossing, 1] = over[a], line[a]
+            active[crossing, 2], active[crossing, 3] = over[b], line[b]
+            rise[crossing] = change
+            crossing += 1
+        fits = _cross(active, rise, crossing, lines, lit_box, left, right, before, onward, many, where, steps)
         meets = False
         for p in loose:
             if piece_polygon[p] == own or height[p, 0] >= h:
@@ -676,12 +708,17 @@ def _look(
                 j = k + 1 if k + 1 < count else 0
                 ax, at, bx, bt = cut2[k, 0], cut2[k, 1], cut2[j, 0], cut2[j, 1]
                 meets = meets or _reaches(lit, corners_lit, lit_box, y0, dy, ax, at, bx, bt)
-                fits = fits and _cross(ax, at, bx, bt, change, lines, left, right, before, many, where, steps)
+                active[k, 0], active[k, 1], active[k, 2], active[k, 3] = ax, at, bx, bt
+                rise[k] = change
+            fits = fits and _cross(active, rise, count, lines, lit_box, left, right, before, onward, many, where, steps)
         tally[EDGES] += edges
         if not fits:
             return STATE_COMPLEX, 0.0, 0.0
         uncut = True
+        layers = 0
         for k in range(lines):
+            layers += onward[k]
+            before[k] += layers
             uncut = uncut and many[k] == 0
         meets = meets or not uncut
         if not meets:
@@ -759,16 +796,22 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
         np.empty(2 * group_room, np.int64), np.empty((4, 2 * group_room)),
     )  # fmt: skip
     planes = np.empty((MAX_SHAFT_PLANES, 4))
-    found, loose = np.empty(many_pieces, np.int64), np.empty(many_pieces, np.int64)
+    found, loose, loose_here = np.empty((3, many_pieces), np.int64)
     box, ring_box = np.empty((2, 3)), np.empty((2, 2))
     scratch = (
         np.empty((ring.shape[0] + 1, 2)), np.empty((2, 2)), np.empty((64, 3)), np.empty((66, 3)), np.empty(most),
-        np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64), np.empty((most, CROSSINGS)),
-        np.empty((most, CROSSINGS), np.int64), np.empty((2, most)), np.empty(2 * group_room),
-        np.empty(2 * group_room), np.empty(2 * group_room), np.zeros(2 * group_room + 1, np.int64),
+        np.empty(most), np.empty(most, np.int64), np.empty(most + 1, np.int64), np.empty(most, np.int64),
+        np.empty((most, CROSSINGS)), np.empty((most, CROSSINGS), np.int64), np.empty((2, most)),
+        np.empty(2 * group_room), np.empty(2 * group_room), np.empty(2 * group_room),
+        np.zeros(2 * group_room + 1, np.int64), np.empty((group_room + 66, 4)),
+        np.empty(group_room + 66, np.int64),
     )  # fmt: skip
     for axis in range(2):
         ring_box[0, axis], ring_box[1, axis] = ring[:, axis].min(), ring[:, axis].max()
+    # The sender in its own frame, for shafts of regions.
+    flat_normal, flat_up, flat_ring = np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros((1, 3))
+    flat_low, flat_high = np.zeros(3), np.zeros(3)
+    flat_low[:2], flat_high[:2] = ring_box[0], ring_box[1]
     longest = 0
     for t in chosen:
         longest = max(longest, tile_start[t + 1] - tile_start[t])
@@ -838,17 +881,13 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
         if tile_edges > tile_room:
             continue
         various = tile_own[t] == DIFFERENT
-        smooth = (
-            apart == 0
-            and not various
-            and (tile_normal[t, 0] != 0.0 or tile_normal[t, 1] != 0.0 or tile_normal[t, 2] != 0.0)
-        )
+        level = not various and (tile_normal[t, 0] != 0.0 or tile_normal[t, 1] != 0.0 or tile_normal[t, 2] != 0.0)
         stack[0, 0], stack[0, 1] = 0, asked
         top = 0
         while top >= 0:
             a, b = stack[top, 0], stack[top, 1]
             top -= 1
-            if not smooth and b - a > GROUP:
+            if not level and b - a > GROUP:
                 top = cut_runs(a, b, GROUP, stack, top)
                 continue
             mark += 1
@@ -856,7 +895,12 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
             edges, highest = _narrow(
                 tile_edges, tile_out, box, ring_box, table, frame, mark, tile_mark, owned, group_marks, group_out
             )
+            close = 0
+            if apart:
+                used = tile_shaft(box, flat_normal, 0.0, flat_low, flat_high, flat_up, flat_ring, slack, planes)
+                close = _inside(loose[:apart], table, place, planes, used, slack, loose_here)
             # Where no edge can pass before the sender all points see alike: one tells.
+            smooth = level and close == 0
             alike = smooth and highest == -np.inf
             fitted = smooth and not alike and b - a > FEW
             if fitted:
@@ -866,8 +910,8 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
                 if count == 0:
                     top = quarter(flat, rows, a, b, spare, stack, top)
                     continue
-            elif edges > min(CROWDED, group_room) and b - a > PART and not alike:
-                top = quarter(flat, rows, a, b, spare, stack, top) if smooth else cut_runs(a, b, PART, stack, top)
+            elif (edges > min(CROWDED, group_room) and b - a > PART and not alike) or b - a > GROUP:
+                top = quarter(flat, rows, a, b, spare, stack, top) if level else cut_runs(a, b, PART, stack, top)
                 continue
             elif edges > group_room:
                 continue
@@ -884,8 +928,8 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
                     seen, hidden, error = _look(
                         places[i - first, 0], places[i - first, 1], places[i - first, 2], nx, ny, nz, own[i],
                         shift(index[i], seed)[0], node_lines if fitted else fewest, most,
-                        NODE_NOISE * allowed if fitted else allowed, ring, group, sizes, frame, table, loose[:apart],
-                        various, scratch, tally,
+                        NODE_NOISE * allowed if fitted else allowed, ring, group, sizes, frame, table,
+                        loose_here[:close], various, scratch, tally,
                     )  # fmt: skip
                     if seen != STATE_COMPLEX:
                         state[i], share[i], doubt[i] = seen, (1.0 - hidden) * part[i], error * part[i]
