@@ -45,8 +45,8 @@ from workbench.shadow.lights import (
 )
 from workbench.shadow.linear import visible_linear_irradiance
 from workbench.shadow.rays import NOISE, visible_shares
-from workbench.shadow.silhouette import MAX_LINES, EdgeTable, SenderFrame, line_tiles
-from workbench.shadow.smooth import fill_smoothly
+from workbench.shadow.silhouette import FIT_NS, MAX_LINES, RAY_NS, RAYED, EdgeTable, SenderFrame, line_tiles
+from workbench.shadow.smooth import ALONE_NOISE, fill_smoothly
 from workbench.shadow.tiles import Tiles, sort_into_tiles
 
 __all__ = ["METHODS", "AreaLight", "OcclusionEstimate", "OcclusionState", "Shader", "estimate"]
@@ -63,20 +63,28 @@ MARGIN = 1.3
 """Errors of neighbouring fits partly cancel: measured errors stay below the asked one by this."""
 LINE_MARGIN = 0.8
 """Share of the asked error that lines are drawn for: what they state scatters from point to point."""
-PILOT_POINTS = 256
-"""Points that give a first idea of the mean irradiance."""
-PILOT_TILES = 12
-"""Tiles that they lie in, at least, where they get lines."""
-PILOT_LINES = 8
-"""Lines at each of them."""
+PILOT_POINTS, PILOT_RAYS = 128, 16
+"""Points that give a first idea of the mean irradiance and of the noise, and rays at each."""
 USUAL_NOISE = 0.22
 """L lines usually leave an error of USUAL_NOISE L^-3/2 of a visible share past a tessellated torus."""
 LIST_LIMIT = 64
 """Longest candidate list of a tile whose points ``auto`` looks at one by one before it draws lines."""
 CUT_LIMIT = 12
-"""Longest candidate list that ``auto`` and ``shaft`` cut exactly."""
+"""Longest candidate list that ``auto`` and ``shaft`` cut exactly in any case."""
+CROWD_LIMIT = 64
+"""And the longest that ``auto`` cuts where that is cheaper than lines and rays."""
+CUT_NS, KEPT_NS = 2000.0, 500.0
+"""Nanoseconds of a cut, and of each candidate left in it."""
+TILE_NS, POINT_NS = 300e3, 20e3
+"""Nanoseconds of lines: of a tile, and of a point at which they are drawn."""
+PREPARE_NS, PREPARED_NS = 3000.0, 150.0
+"""Nanoseconds a piece of all geometry before the first line is drawn, and with a sender that was asked before."""
+FRAMES = 4
+"""Senders whose frames are kept."""
 LEAST_MEAN = 0.05
 """``auto``: of darker scenes the error is asked relative to this share of the unoccluded irradiance."""
+BLOCK_POINTS = 512
+"""Points a block of work on one thread, at least."""
 LIFT = 1e-9
 """Distance by which rays of the instrument begin and end off surfaces, as a share of the scene's size."""
 ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
@@ -152,7 +160,21 @@ class OcclusionEstimate:
 
 def _rays_for(error: float) -> int:
     """Rays at a point whose visible share is wanted to ``error``."""
-    return int(min(max((NOISE / error) ** (4.0 / 3.0), 16), 65536))
+    return int(min(max(math.ceil((NOISE / error) ** (4.0 / 3.0)), 4), 65536))
+
+
+@dataclass(frozen=True)
+class _Pilot:
+    """What a few points tell: the mean form factor over all points, and the stated error of a share at waiting ones."""
+
+    mean: float
+    doubt: float
+
+    def rays(self, error: float) -> int:
+        """Rays at each waiting point that leave ``error`` of a share, as they state it."""
+        times = self.doubt / error
+        # What is stated where few rays agree falls as their number, all else faster.
+        return min(max(math.ceil(PILOT_RAYS * max(times, times ** (4.0 / 3.0))), 4), _rays_for(error))
 
 
 @dataclass(frozen=True)
@@ -259,6 +281,7 @@ class Shader:
         if self.workers < 1:
             raise OptionError(f"workers: found {workers}, expected 1 or more")
         self._box_tree = tree = BoxTree.build(geometry)
+        self._frames: dict[bytes, SenderFrame] = {}
         self._through = np.ascontiguousarray(geometry.polygon_transmittance[geometry.piece_polygon])
         self._tree = (tree.low, tree.high, tree.skip, tree.first, tree.count, tree.order, geometry.piece_bounds)
 
@@ -502,17 +525,19 @@ class Shader:
         owners, polygon = self._owners(polygons)
         n = len(tiles.points)
         whole, seen, doubt = np.zeros(n), np.zeros(n), np.zeros(n)
-        waiting_parts: list[tuple[FloatArray, IntArray, FloatArray]] = []
+        waiting_parts: list[tuple[FloatArray, IntArray, FloatArray, _Pilot | None]] = []
         lit, dark = np.ones(n, dtype=bool), np.ones(n, dtype=bool)
         candidates = np.full(n, -1 if task.method in _UNCULLED else 0, dtype=np.int64)
         for ring in pieces:
             begin = time.perf_counter()
+            pilot = None
             found = self._settle(tiles, ring, normal, owners, polygon, task)
             task.seconds["settle"] = task.seconds.get("settle", 0.0) + time.perf_counter() - begin
             if task.method == "auto":
-                begin = time.perf_counter()
-                self._draw_lines(tiles, ring, normal, owners, polygon, found, task)
-                task.seconds["lines"] = task.seconds.get("lines", 0.0) + time.perf_counter() - begin
+                waiting = np.flatnonzero(found.state == _settle.STATE_COMPLEX)
+                if len(waiting):
+                    pilot = self._pilot(tiles, ring, normal, polygon, found, waiting, task)
+                    self._finish(tiles, ring, normal, owners, polygon, found, pilot, task)
             whole += found.part
             if task.method not in _UNCULLED:
                 candidates += found.candidates
@@ -524,15 +549,15 @@ class Shader:
                 task.seconds["cut"] = task.seconds.get("cut", 0.0) + time.perf_counter() - begin
             else:
                 known[waiting] = False
-                waiting_parts.append((ring, waiting, found.part))
+                waiting_parts.append((ring, waiting, found.part, pilot))
             seen[known] += found.share[known]
             doubt += found.doubt
             lit &= (found.state == _settle.STATE_CLEAR) | (found.part == 0.0)
             dark &= known & (found.share == 0.0) & (found.state != _settle.STATE_SAMPLED)
-        for ring, waiting, part in waiting_parts:
+        for ring, waiting, part, pilot in waiting_parts:
             if len(waiting):
                 begin = time.perf_counter()
-                self._trace(tiles, waiting, ring, normal, polygon, part, seen, doubt, task)
+                self._trace(tiles, waiting, ring, normal, polygon, part, seen, doubt, pilot, task)
                 task.seconds["rays"] = task.seconds.get("rays", 0.0) + time.perf_counter() - begin
         state = np.full(n, OcclusionState.COMPLEX_SHADOW, dtype=np.int8)
         state[lit] = OcclusionState.NOT_INSHADOW
@@ -547,21 +572,23 @@ class Shader:
         found = _Settled.empty(len(tiles.points))
         # 0: only the open form factors are asked for.
         counts = np.full(len(tiles.start) - 1, -1 if culled else 0, dtype=np.int64)
-        self._settle_tiles(tiles, ring, normal, owners, own, counts, found, task, list_first=culled)
+        self._settle_tiles(
+            tiles, ring, normal, owners, own, counts, found, task, 64 if task.method == "exact" else CUT_LIMIT,
+            list_first=culled,
+        )  # fmt: skip
         if not culled:
             found.state[found.state == _settle.STATE_CLEAR] = _settle.STATE_COMPLEX
         return found
 
     def _settle_tiles(
         self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, counts: IntArray,
-        found: _Settled, task: _Task, *, list_first: bool,
+        found: _Settled, task: _Task, limit: int, *, list_first: bool = False,
     ) -> None:  # fmt: skip
-        """Settle tiles by their candidates: as listed in ``counts`` or, ``list_first``, as shafts find them."""
+        """Settle tiles by their candidates, cutting up to ``limit``: as listed in ``counts`` or as shafts find them."""
         geo = self.geometry
         count = len(counts)
         lists = np.empty((count if list_first else 0, _settle.MAX_CANDIDATES), dtype=np.int64)
         low, high = ring.min(axis=0), ring.max(axis=0)
-        limit = 64 if task.method == "exact" else CUT_LIMIT
 
         def work(first: int, last: int) -> NDArray[np.int64]:
             tally = new_tally()
@@ -580,13 +607,13 @@ class Shader:
             )  # fmt: skip
             return tally
 
-        for tally in self._blocks(work, count):
+        for tally in self._blocks(work, count, min(64, -(-len(tiles.points) // BLOCK_POINTS))):
             if task.method in _UNCULLED:
                 task.counters.add(closed_forms=tally[CLOSED])
             else:
                 add_tally(task.counters, tally)
 
-    def _blocks(self, work: Callable[[int, int], NDArray[np.int64]], count: int, most: int = 64) -> list[IntArray]:
+    def _blocks(self, work: Callable[[int, int], NDArray[np.int64]], count: int, most: int) -> list[IntArray]:
         """Tallies of ``work(first, last)`` over ``most`` equal ranges of ``count`` rows, on all workers."""
         step = max(1, -(-count // most))
         ranges = [(first, min(first + step, count)) for first in range(0, count, step)]
@@ -595,17 +622,88 @@ class Shader:
         with ThreadPoolExecutor(self.workers) as pool:
             return list(pool.map(lambda each: work(*each), ranges))
 
+    def _finish(
+        self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, found: _Settled,
+        pilot: _Pilot, task: _Task,
+    ) -> None:  # fmt: skip
+        """``auto`` at the points that ``found`` leaves: cuts or lines, or nothing where rays are cheaper.
+
+        Each tile gets what its candidates, the asked error and the number of its points make cheapest.
+        """
+        waiting = np.flatnonzero(found.state == _settle.STATE_COMPLEX)
+        allowed = self._allowed(found.part, waiting, pilot.mean, task)
+        worth = RAY_NS * pilot.rays(MARGIN * ALONE_NOISE * allowed)
+        allowed *= LINE_MARGIN
+        tile = tiles.of(waiting)
+        chosen, first, held = np.unique(tile, return_index=True, return_counts=True)
+        few = np.minimum(held, RAYED)
+        flat = (tiles.normal[chosen] != 0.0).any(axis=1)
+        rayed = np.where(flat, np.minimum(worth * held, worth * few + FIT_NS * held), worth * held)
+        lined = TILE_NS + POINT_NS * few
+        if CROWD_LIMIT > CUT_LIMIT and (held * CUT_NS < np.minimum(rayed, lined)).any():
+            begin = time.perf_counter()
+            cut = np.where(held * (CUT_NS + KEPT_NS) < np.minimum(rayed, lined), 0.0, np.inf)
+            for part in (2, 4, 1):  # its middle, and if there is hope more of it
+                asked = np.flatnonzero(cut < np.inf)
+                some = waiting[np.minimum(first + held // part, first + held - 1)[asked]]
+                kept = self._crowds(tiles, ring, normal, owners, own, some, task)
+                price = np.where(kept <= CROWD_LIMIT, CUT_NS + KEPT_NS * kept, np.inf)
+                cut[asked] += held[asked] * price / 3.0
+            short = cut < np.minimum(rayed, lined)
+            counts = np.full(len(tiles.start) - 1, _settle.PASSED, dtype=np.int64)
+            counts[chosen[short]] = -1
+            self._settle_tiles(tiles, ring, normal, owners, own, counts, found, task, CROWD_LIMIT)
+            chosen = np.unique(tiles.of(np.flatnonzero(found.state == _settle.STATE_COMPLEX)))
+            rayed = rayed[np.isin(np.unique(tile), chosen)]
+            task.seconds["crowds"] = task.seconds.get("crowds", 0.0) + time.perf_counter() - begin
+        ready = ring.tobytes() in self._frames
+        if len(chosen) and rayed.sum() > self.geometry.piece_count * (PREPARED_NS if ready else PREPARE_NS):
+            begin = time.perf_counter()
+            self._draw_lines(tiles, ring, normal, owners, own, found, chosen, allowed, worth, task)
+            task.seconds["lines"] = task.seconds.get("lines", 0.0) + time.perf_counter() - begin
+
+    def _pilot(
+        self, tiles: Tiles, ring: FloatArray, normal: FloatArray, own: int, found: _Settled, waiting: IntArray,
+        task: _Task,
+    ) -> _Pilot:  # fmt: skip
+        """A few rays at some of the waiting points."""
+        some = waiting[:: max(1, len(waiting) // PILOT_POINTS)]
+        share, doubt = self._sample(tiles, some, PILOT_RAYS, ring, normal, own, task)
+        known = float(found.share[found.state != _settle.STATE_COMPLEX].sum())
+        mean = (known + float((share * found.part[some]).mean()) * len(waiting)) / len(found.state)
+        return _Pilot(mean, math.sqrt(float((doubt**2).mean())))
+
+    def _crowds(
+        self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, some: IntArray,
+        task: _Task,
+    ) -> IntArray:  # fmt: skip
+        """Candidates at some points, one more than ``CROWD_LIMIT`` for a longer list or more pieces than can be cut."""
+        trial = _Settled.empty(len(tiles.points))
+        trial.state[:] = _settle.STATE_CLEAR
+        trial.state[some] = _settle.STATE_COMPLEX
+        counts = np.full(len(tiles.start) - 1, _settle.PASSED, dtype=np.int64)
+        counts[tiles.of(some)] = -1
+        self._settle_tiles(tiles, ring, normal, owners, own, counts, trial, task, CROWD_LIMIT)
+        return np.where(trial.state[some] == _settle.STATE_COMPLEX, CROWD_LIMIT + 1, trial.candidates[some])
+
+    def _frame(self, ring: FloatArray, normal: FloatArray) -> SenderFrame:
+        """The geometry in a sender's frame; those of the last few senders are kept."""
+        key = ring.tobytes()
+        frame = self._frames.pop(key, None)
+        if frame is None:
+            frame = SenderFrame.build(self.geometry, self._edges, ring, normal)
+        self._frames[key] = frame
+        while len(self._frames) > FRAMES:
+            self._frames.pop(next(iter(self._frames)))
+        return frame
+
     def _draw_lines(
         self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, found: _Settled,
-        task: _Task,
+        chosen: IntArray, allowed: float, worth: float, task: _Task,
     ) -> None:  # fmt: skip
-        """Lines over the sender at the points that ``found`` leaves, as many as the error asks."""
-        state = found.state
-        waiting = np.flatnonzero(state == _settle.STATE_COMPLEX)
-        if not len(waiting):
-            return
+        """Lines over the sender in chosen tiles, as many as the error asks."""
         edges = self._edges
-        frame = SenderFrame.build(self.geometry, edges, ring, normal)
+        frame = self._frame(ring, normal)
         tree = self._tree
         sender = (ring, ring.min(axis=0), ring.max(axis=0), normal, own, frame.width)
         table = (
@@ -617,40 +715,25 @@ class Shader:
             tiles.points, tiles.normals, tiles.order, tiles.own, tiles.flat, tiles.start, tiles.bounds, tiles.normal,
             tiles.offset, tiles.polygon,
         )  # fmt: skip
-
-        def draw(chosen: IntArray, answer: _Settled, fewest: int, most: int, allowed: float, rays: int) -> None:
-            def work(first: int, last: int) -> NDArray[np.int64]:
-                tally = new_tally()
-                line_tiles(
-                    chosen[first:last], spread, sender, table, axes, tree, task.slack, fewest, most, allowed,
-                    rays, task.seed, CUT_LIMIT,
-                    (answer.part, answer.share, answer.doubt, answer.state, answer.candidates), tally,
-                )  # fmt: skip
-                return tally
-
-            for tally in self._blocks(work, len(chosen), 8 * self.workers):
-                add_tally(task.counters, tally)
-
-        # The error is asked of the irradiance over all points: what may a share here be off by?
-        tile = tiles.of(waiting)
-        chosen = np.unique(tile)
-        some = chosen[:: max(1, min(len(chosen) // PILOT_TILES, len(waiting) // PILOT_POINTS))]
-        pilot = waiting[np.isin(tile, some)]
-        pilot = pilot[:: max(1, len(pilot) // PILOT_POINTS)]
-        trial = replace(found, share=found.share.copy(), doubt=found.doubt.copy(), state=np.zeros_like(state))
-        trial.state[pilot] = _settle.STATE_COMPLEX
-        draw(np.unique(tiles.of(pilot)), trial, PILOT_LINES, PILOT_LINES, 1.0, PILOT_POINTS)
-        drawn = pilot[trial.state[pilot] != _settle.STATE_COMPLEX]
-        known = float(found.share[state != _settle.STATE_COMPLEX].sum())
-        mean = (known + float(trial.share[drawn].sum()) / len(pilot) * len(waiting)) / len(state)
-        allowed = LINE_MARGIN * self._allowed(found.part, waiting, mean, task)
+        answer = (found.part, found.share, found.doubt, found.state, found.candidates)
         fewest = min(max(math.ceil((USUAL_NOISE / allowed) ** (2.0 / 3.0)), 4), MAX_LINES)
-        draw(chosen, found, fewest, min(16 * fewest, MAX_LINES), allowed, _rays_for(allowed))
-        left = np.unique(tiles.of(np.flatnonzero(state == _settle.STATE_COMPLEX)))
+
+        def work(first: int, last: int) -> NDArray[np.int64]:
+            tally = new_tally()
+            line_tiles(
+                chosen[first:last], spread, sender, table, axes, tree, task.slack, fewest, min(16 * fewest, MAX_LINES),
+                allowed, worth, task.seed, CUT_LIMIT, answer, tally,
+            )  # fmt: skip
+            return tally
+
+        # Each block makes marks for all pieces.
+        for tally in self._blocks(work, len(chosen), min(8 * self.workers, max(self.workers, len(chosen) // 4))):
+            add_tally(task.counters, tally)
+        left = np.unique(tiles.of(np.flatnonzero(found.state == _settle.STATE_COMPLEX)))
         if len(left):
             counts = np.full(len(tiles.start) - 1, _settle.PASSED, dtype=np.int64)
             counts[left] = -1
-            self._settle_tiles(tiles, ring, normal, owners, own, counts, found, task, list_first=False)
+            self._settle_tiles(tiles, ring, normal, owners, own, counts, found, task, CUT_LIMIT)
 
     @staticmethod
     def _allowed(part: FloatArray, waiting: IntArray, mean: float, task: _Task) -> float:
@@ -717,34 +800,39 @@ class Shader:
             answer.state[rows[left.order]] = cut.state
         return answer
 
+    def _sample(
+        self, tiles: Tiles, rows: IntArray, count: int, ring: FloatArray, normal: FloatArray, polygon: int, task: _Task
+    ) -> tuple[FloatArray, FloatArray]:
+        """Visible shares of a convex piece by ``count`` rays a point, and their standard errors."""
+        if not (task.method in ("adaptive", "rays+plane-vertex") or self._through.any()):
+            tracer = self.tracer
+            share = visible_shares(
+                tracer, tiles.points[rows], tiles.normals[rows], tiles.order[rows], [ring], normal, count=count,
+                seed=task.seed, workers=self.workers,
+            )  # fmt: skip
+            task.counters.add(rays=len(rows) * count)
+            return share
+        bundle = self._bundle(tiles, rows, count, task)
+        if task.method == "adaptive":
+            return _sampled.adaptive_shares(self.grid, bundle, ring, normal, polygon, task.counters)
+        check = task.method == "rays+plane-vertex"
+        return _sampled.woo_shares(self.grid, bundle, ring, normal, polygon, check, task.counters)
+
     def _trace(
         self, tiles: Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, polygon: int, part: FloatArray,
-        seen: FloatArray, doubt: FloatArray, task: _Task,
+        seen: FloatArray, doubt: FloatArray, pilot: _Pilot | None, task: _Task,
     ) -> None:  # fmt: skip
         """Rays at the points that are left, all of them or as many as a smooth fit needs."""
-        n = len(tiles.points)
 
         def sample(rows: IntArray, count: int) -> tuple[FloatArray, FloatArray]:
-            bundle = self._bundle(tiles, rows, count, task)
-            if task.method == "adaptive":
-                value, noise = _sampled.adaptive_shares(self.grid, bundle, ring, normal, polygon, task.counters)
-            elif task.method == "rays+plane-vertex" or self._through.any():
-                value, noise = _sampled.woo_shares(
-                    self.grid, bundle, ring, normal, polygon, task.method == "rays+plane-vertex", task.counters
-                )
-            else:
-                value, noise = visible_shares(
-                    self.tracer, bundle.points, bundle.normals, bundle.index, [ring], normal, count=count,
-                    seed=task.seed, workers=self.workers,
-                )  # fmt: skip
-                task.counters.add(rays=len(rows) * count)
-            return value, noise
+            return self._sample(tiles, rows, count, ring, normal, polygon, task)
 
-        if task.method == "auto":
+        count = task.samples
+        if pilot is not None:
             # The error is asked of the irradiance over all points: what may a share here be off by?
-            pilot = waiting[:: max(1, len(waiting) // PILOT_POINTS)]
-            mean = (seen.sum() + float((sample(pilot, 16)[0] * part[pilot]).mean()) * len(waiting)) / n
-            allowed = MARGIN * self._allowed(part, waiting, mean, task)
+            allowed = MARGIN * self._allowed(part, waiting, pilot.mean, task)
+            count = pilot.rays(ALONE_NOISE * allowed)
+        if pilot is not None and RAY_NS * count > FIT_NS:
             # Rows of the complex points only, tile by tile.
             tile = tiles.of(waiting)
             edges = np.concatenate([[0], np.flatnonzero(np.diff(tile)) + 1, [len(waiting)]])
@@ -754,7 +842,7 @@ class Shader:
                 share, spread, error=allowed,
             )  # fmt: skip
         else:
-            share, spread = sample(waiting, task.samples)
+            share, spread = sample(waiting, count)
         seen[waiting] += share * part[waiting]
         doubt[waiting] += spread * part[waiting]
 

@@ -35,7 +35,7 @@ from workbench.shadow._tile_fit import NODE_GAP, NODES, TERMS, cubic_at, cut_run
 from workbench.shadow.rays import shift
 from workbench.shadow.tiles import DIFFERENT
 
-__all__ = ["LINE_NOISE", "MAX_LINES", "EdgeTable", "SenderFrame", "line_tiles"]
+__all__ = ["FIT_NS", "LINE_NOISE", "MAX_LINES", "RAYED", "RAY_NS", "EdgeTable", "SenderFrame", "line_tiles"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -60,8 +60,11 @@ BLUR = 0.5
 """Share of the sender's width by which edges may move over it from one node of a fit to the next."""
 CROWDED = 512
 """Edges that make a list long."""
-EDGES_A_RAY = 8
-"""Edges that cost as much as a ray, and some more: fits need rays at some of the points only."""
+RAY_NS, PIECE_NS, EDGE_NS, LOOSE_NS, LINE_NS = 90.0, 150.0, 8.0, 180.0, 80.0
+"""Measured nanoseconds of a ray, of a piece met by the shaft of a tile, and of what a point looks at: an edge, a
+piece that reaches its height or the sender's plane, a line.  Only their ratios matter."""
+RAYED, FIT_NS = 64, 1000.0
+"""Points of a flat tile that get rays where a fit takes the others, about, and nanoseconds of each of these."""
 CROSSINGS = 128
 """Most crossings of a line that are kept; a point with more is left to rays."""
 NEAR = 1e-10
@@ -750,7 +753,7 @@ def _look(
 
 
 @njit(nogil=True, cache=True)
-def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, allowed, rays, seed, limit, out, tally):
+def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, allowed, worth, seed, limit, out, tally):
     """Visible shares of the points of ``chosen`` tiles whose state is COMPLEX, by lines.
 
     ``fewest`` lines are drawn, and more (up to ``most``) where the share's error is then above
@@ -758,8 +761,8 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
     DARK; others become SAMPLED.  On a flat tile the share is smooth as far as the light blurs the
     nearest edge: there lines are drawn at some points, and where the share fitted to them foretells each
     of them it is taken for the others.  Left COMPLEX are points with panes before the sender, with a
-    line of too many crossings, or with so many pieces or edges to look at that ``rays`` rays a point
-    would be cheaper.
+    line of too many crossings, or with so many pieces or edges to look at that rays, which cost
+    ``worth`` nanoseconds a point, would be cheaper.
     """
     points, normals, index, own, flat, tile_start, tile_bounds, tile_normal, tile_offset, tile_own = tiles
     corners, sender_low, sender_high, sender_normal, sender_own, sender_width = sender
@@ -785,7 +788,7 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
         np.zeros(place.shape[0], np.int64), np.zeros(place.shape[0], np.int64), tile_marks[4],
     )  # fmt: skip
     piece_mark, piece_class = tile_marks[0], tile_marks[1]
-    room = min(max(EDGES_A_RAY * rays, 1024), 32768)
+    room = int(min(max(worth / EDGE_NS, 1024.0), 32768.0))
     many_pieces = min(pieces, 4 * room)
     tile_room = min(ends.shape[0], 8 * room)
     tile_out = np.empty(tile_room, np.int64), np.empty(tile_room, np.int64), np.empty((tile_room, 2), np.int64)
@@ -845,7 +848,12 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
                 asked += 1
         if box[0, 2] <= 0.0 or asked == 0:
             continue
-        budget = min(many_pieces, max(EDGES_A_RAY * rays * asked, 64))
+        various = tile_own[t] == DIFFERENT
+        level = not various and (tile_normal[t, 0] != 0.0 or tile_normal[t, 1] != 0.0 or tile_normal[t, 2] != 0.0)
+        price = worth * asked
+        if level:
+            price = min(price, worth * RAYED + FIT_NS * asked)
+        budget = min(many_pieces, max(int(price / PIECE_NS), 64))
         used = tile_shaft(
             tile_bounds[t], tile_normal[t], tile_offset[t], sender_low, sender_high, sender_normal, corners, slack,
             planes,
@@ -880,8 +888,6 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
         tile_edges = _tile_edges(found[:kept], box, ring_box, table, frame, mark, tile_marks, tile_out)
         if tile_edges > tile_room:
             continue
-        various = tile_own[t] == DIFFERENT
-        level = not various and (tile_normal[t, 0] != 0.0 or tile_normal[t, 1] != 0.0 or tile_normal[t, 2] != 0.0)
         stack[0, 0], stack[0, 1] = 0, asked
         top = 0
         while top >= 0:
@@ -903,17 +909,19 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
             smooth = level and close == 0
             alike = smooth and highest == -np.inf
             fitted = smooth and not alike and b - a > FEW
+            looks = NODES / (b - a) if fitted else 1.0
+            dear = edges > group_room or looks * (edges * EDGE_NS + close * LOOSE_NS + fewest * LINE_NS) > worth
             if fitted:
                 count = 0
-                if edges <= group_room and _blurred(box, highest, ring_box, sender_width):
+                if not dear and _blurred(box, highest, ring_box, sender_width):
                     count = pick_nodes(flat, rows, a, b, region, nodes)
                 if count == 0:
                     top = quarter(flat, rows, a, b, spare, stack, top)
                     continue
-            elif (edges > min(CROWDED, group_room) and b - a > PART and not alike) or b - a > GROUP:
+            elif not alike and (b - a > GROUP or ((dear or edges > CROWDED) and b - a > PART)):
                 top = quarter(flat, rows, a, b, spare, stack, top) if level else cut_runs(a, b, PART, stack, top)
                 continue
-            elif edges > group_room:
+            elif dear:
                 continue
             else:
                 count = 1 if alike else b - a

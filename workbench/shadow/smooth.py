@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["SAMPLE_NOISE", "fill_smoothly"]
+__all__ = ["ALONE_NOISE", "SAMPLE_NOISE", "fill_smoothly"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
