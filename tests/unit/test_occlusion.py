@@ -24,7 +24,7 @@ from workbench.shadow.lights import (
     SphereLight,
     SpotLight,
 )
-from workbench.shadow.occlusion import METHODS, AreaLight, OcclusionState, Shader, estimate
+from workbench.shadow.occlusion import METHODS, PILOT_POINTS, PILOT_RAYS, AreaLight, OcclusionState, Shader, estimate
 from workbench.shadow.rays import lattice, sender_samples
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -298,8 +298,9 @@ def test_auto_meets_its_asked_error_under_a_torus(torus, error):
     for seed in (0, 1):
         found = torus.estimate(points, UP, SQUARE, "auto", error=error, seed=seed)
         assert np.sqrt(np.mean((found.irradiance[:, 0] - exact) ** 2)) <= error * exact.mean()
-        # And without rays: by lines, of which L leave some 0.17 L^-3/2; the share may be off by 0.35 errors here.
-        assert found.counters["rays"] == 0
+        # And without rays but the pilot's: by lines, of which L leave some 0.17 L^-3/2; the share may be off by 0.35
+        # errors here.
+        assert found.counters["rays"] <= 2 * PILOT_POINTS * PILOT_RAYS
         assert found.counters["sender_lines"] < 4 * (0.17 / (0.35 * error)) ** (2 / 3) * len(points)
 
 
@@ -334,8 +335,8 @@ def test_auto_draws_few_lines_where_all_is_dark():
     found = estimate(points, UP, SQUARE, geometry_of(list(vertices[faces])), "auto", workers=1)
     assert not found.irradiance.any()
     assert (found.state == DARK).all()
-    assert found.counters["rays"] == 0
-    # The pilot's alone: 8 at some 256 points.
+    # The pilot's alone.
+    assert found.counters["rays"] <= 2 * PILOT_POINTS * PILOT_RAYS
     assert found.counters["sender_lines"] <= 8 * 512
 
 

@@ -19,7 +19,7 @@ from instrument_scenes import (
 
 from workbench.geometry.tessellation import sphere_mesh
 from workbench.shadow import occlusion, silhouette
-from workbench.shadow.occlusion import AreaLight, OcclusionState, Shader
+from workbench.shadow.occlusion import PILOT_POINTS, PILOT_RAYS, AreaLight, OcclusionState, Shader
 from workbench.shadow.silhouette import EdgeTable, SenderFrame
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -28,11 +28,15 @@ L_SHAPE = np.array([[-1, -1, 2], [-1, 1, 2], [0, 1, 2], [0, 0, 2], [1, 0, 2], [1
 DARK, LIT, COMPLEX = OcclusionState.INSHADOW, OcclusionState.NOT_INSHADOW, OcclusionState.COMPLEX_SHADOW
 
 
+def leave_all_to_lines(patch):
+    """``auto`` cuts no list, however short, and finds rays dear."""
+    for name, value in (("CUT_LIMIT", 0), ("LIST_LIMIT", 0), ("CROWD_LIMIT", 0), ("RAY_NS", 1e12)):
+        patch.setattr(occlusion, name, value)
+
+
 @pytest.fixture
 def only_lines(monkeypatch):
-    """``auto`` cuts no list, however short: all is left to lines."""
-    monkeypatch.setattr(occlusion, "CUT_LIMIT", 0)
-    monkeypatch.setattr(occlusion, "LIST_LIMIT", 0)
+    leave_all_to_lines(monkeypatch)
 
 
 def torus_triangles(radius, tube, steps, centre, turn):
@@ -64,7 +68,7 @@ def compare(shader, points, normals, light, far=False, **options):
     """Hold ``auto`` by lines against exact cuts; returns (error / standard error) where lines were drawn."""
     exact = shader.estimate(points, normals, light, "exact", **options)
     found = shader.estimate(points, normals, light, "auto", error=1e-3, **options)
-    assert found.counters["rays"] == 0
+    assert found.counters["rays"] <= 4 * PILOT_RAYS * min(len(points), 2 * PILOT_POINTS)  # four pieces of a light
     state, whole = found.state[:, 0], exact.open_share[:, 0]
     gap = np.abs(found.visible_share - exact.visible_share)[:, 0]
     doubt = np.hypot(found.standard_error, exact.standard_error)[:, 0] / math.pi
@@ -100,8 +104,7 @@ def nasty(seed, count, far, turned, concave):
 )
 def test_lines_agree_with_exact_cuts_past_nasty_polygons(seed, count, far, turned, concave):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(occlusion, "CUT_LIMIT", 0)
-        patch.setattr(occlusion, "LIST_LIMIT", 0)
+        leave_all_to_lines(patch)
         shader, points, light = nasty(seed, count, far, turned, concave)
         compare(shader, points, UP, light, far > 0.0)
 
@@ -150,7 +153,9 @@ def test_union_of_overlapping_tessellated_occluders(seed):
     flipped = rng.random(len(triangles)) < 0.5  # wound as they come
     triangles[flipped] = triangles[flipped][:, ::-1]
     points = np.column_stack([rng.uniform(-1.2, 1.2, (40, 2)), np.zeros(40)])
-    compare(Shader(geometry_of(list(triangles)), 1), points, UP, SQUARE)
+    with pytest.MonkeyPatch.context() as patch:
+        leave_all_to_lines(patch)
+        compare(Shader(geometry_of(list(triangles)), 1), points, UP, SQUARE)
 
 
 def test_sensors_on_the_tessellated_surface_itself(only_lines):

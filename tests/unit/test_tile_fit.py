@@ -8,7 +8,7 @@ from broken_kernels import break_kernel
 from instrument_scenes import UNIT_SQUARE_LIGHT, geometry_of
 from test_silhouette import ball, torus_triangles
 
-from workbench.shadow import silhouette
+from workbench.shadow import occlusion, silhouette
 from workbench.shadow._tile_fit import FEWEST, NODES, TERMS, cubic_at, cut_runs, fit_cubic, pick_nodes, quarter
 from workbench.shadow.occlusion import AreaLight, OcclusionState, Shader
 
@@ -118,6 +118,17 @@ def test_fits_meet_the_asked_error_and_state_their_own(floor, error):
     assert found.counters["fitted_points"] > len(found.state) / 4
     assert made <= error
     assert 0.3 * stated < made < 1.3 * stated
+
+
+def test_fits_to_rays_miss_no_small_shadow_either(floor, monkeypatch):
+    monkeypatch.setattr(occlusion, "line_tiles", lambda *arguments: None)
+    monkeypatch.setattr(occlusion, "CROWD_LIMIT", 0)
+    made, _, found = held_to_exact(floor, 0.03)
+    assert made <= 0.03
+    assert 0 < found.counters["rays"] < 0.5 * (0.64 / (0.35 * 0.03)) ** (4 / 3) * len(found.state)
+    monkeypatch.setattr(occlusion, "BLUR", 1e9)
+    with pytest.raises(AssertionError):
+        held_to_exact(floor, 0.03)
 
 
 def test_a_fit_over_sharp_shadows_is_noticed(floor, monkeypatch):

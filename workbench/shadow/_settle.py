@@ -6,6 +6,8 @@ few is cut exactly, what has many is left COMPLEX for rays.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -265,3 +267,67 @@ def exact_points(
                             stack[top, 0, axis], stack[top, 1, axis], stack[top, 2, axis] = ab, bd, da
         share[i] = total
         doubt[i] = unsure
+
+
+@njit(nogil=True, cache=True)
+def smooth_sides(
+    chosen, bounds_of, normal, offset, own, ring, sender_low, sender_high, sender_normal, sender_own, width,
+    piece_polygon, low, high, skip, head, leaf, order, bounds, slack, sides,
+):  # fmt: skip
+    """Sides of squares, on each chosen tile, over which an edge moves across the sender by its width.
+
+    From a point at height h above the sender's plane an edge at height z moves over the sender z / (h - z)
+    times as fast as the point does along it, and faster where the point comes nearer to the sender's plane.
+    No piece that may come before the sender lies higher than the box of one that meets the tile's shaft.
+    """
+    planes = np.empty((MAX_SHAFT_PLANES, 4))
+    level = 0.0
+    for axis in range(3):
+        level += sender_normal[axis] * ring[0, axis]
+    for row in range(chosen.shape[0]):
+        t = chosen[row]
+        sides[row] = 0.0
+        if normal[t, 0] == 0.0 and normal[t, 1] == 0.0 and normal[t, 2] == 0.0:
+            continue
+        used = tile_shaft(
+            bounds_of[t], normal[t], offset[t], sender_low, sender_high, sender_normal, ring, slack, planes
+        )
+        near, aside = -level, 0.0
+        for axis in range(3):
+            near += min(sender_normal[axis] * bounds_of[t, 0, axis], sender_normal[axis] * bounds_of[t, 1, axis])
+            aside += max(bounds_of[t, 1, axis] - sender_low[axis], sender_high[axis] - bounds_of[t, 0, axis])
+        top = 0.0
+        node = 0
+        while node < low.shape[0] and top < near:
+            if _box_outside(low[node], high[node], planes, used, slack):
+                node = skip[node]
+                continue
+            for i in range(head[node], head[node] + leaf[node]):
+                p = order[i]
+                if piece_polygon[p] == own[t] or piece_polygon[p] == sender_own:
+                    continue
+                if not _box_outside(bounds[p, 0], bounds[p, 1], planes, used, slack):
+                    height = -level
+                    for axis in range(3):
+                        height += max(
+                            sender_normal[axis] * bounds[p, 0, axis], sender_normal[axis] * bounds[p, 1, axis]
+                        )
+                    top = max(top, height)
+            node += 1
+        if top < near:
+            tilt = 0.0
+            for axis in range(3):
+                tilt += normal[t, axis] * sender_normal[axis]
+            rise = math.sqrt(max(1.0 - tilt * tilt, 0.0))
+            sides[row] = width * (near - top) / (max(top, 1e-9 * near) * (1.0 + rise * aside / near))
+
+
+@njit(nogil=True, cache=True)
+def _box_outside(low, high, planes, used, slack):
+    for k in range(used):
+        reach = 0.0
+        for axis in range(3):
+            reach += planes[k, axis] * (high[axis] if planes[k, axis] > 0.0 else low[axis])
+        if reach < planes[k, 3] - slack:
+            return True
+    return False

@@ -32,6 +32,7 @@ from workbench.geometry.flat import Geometry
 from workbench.geometry.lambert import lambert_piece
 from workbench.geometry.polygons import check_polygon, convex_pieces, plane_basis, vector_area
 from workbench.shadow import _sampled, _settle
+from workbench.shadow._tile_fit import NODE_GAP
 from workbench.shadow.area import MAX_CORNERS
 from workbench.shadow.hardware_camera import CameraState, camera_shadows
 from workbench.shadow.lights import (
@@ -45,7 +46,17 @@ from workbench.shadow.lights import (
 )
 from workbench.shadow.linear import visible_linear_irradiance
 from workbench.shadow.rays import NOISE, visible_shares
-from workbench.shadow.silhouette import FIT_NS, MAX_LINES, RAY_NS, RAYED, EdgeTable, SenderFrame, line_tiles
+from workbench.shadow.silhouette import (
+    BLUR,
+    FIT_NS,
+    MAX_LINES,
+    RAY_NS,
+    RAYED,
+    EdgeTable,
+    SenderFrame,
+    line_tiles,
+    sender_width,
+)
 from workbench.shadow.smooth import ALONE_NOISE, fill_smoothly
 from workbench.shadow.tiles import Tiles, sort_into_tiles
 
@@ -73,12 +84,14 @@ CUT_LIMIT = 12
 """Longest candidate list that ``auto`` and ``shaft`` cut exactly in any case."""
 CROWD_LIMIT = 64
 """And the longest that ``auto`` cuts where that is cheaper than lines and rays."""
-CUT_NS, KEPT_NS = 2000.0, 500.0
-"""Nanoseconds of a cut, and of each candidate left in it."""
+CUT_NS, KEPT_NS, VOXEL_NS = 2000.0, 500.0, 1400.0
+"""Nanoseconds of a cut, of each candidate left in it, and of a ray of the instrument, which panes need."""
 TILE_NS, POINT_NS = 300e3, 20e3
 """Nanoseconds of lines: of a tile, and of a point at which they are drawn."""
 PREPARE_NS, PREPARED_NS = 3000.0, 150.0
 """Nanoseconds a piece of all geometry before the first line is drawn, and with a sender that was asked before."""
+FILL_NS = 2e6
+"""Nanoseconds of fits to rays, however few the points are."""
 FRAMES = 4
 """Senders whose frames are kept."""
 LEAST_MEAN = 0.05
@@ -574,7 +587,7 @@ class Shader:
         counts = np.full(len(tiles.start) - 1, -1 if culled else 0, dtype=np.int64)
         self._settle_tiles(
             tiles, ring, normal, owners, own, counts, found, task, 64 if task.method == "exact" else CUT_LIMIT,
-            list_first=culled,
+            len(tiles.points), list_first=culled,
         )  # fmt: skip
         if not culled:
             found.state[found.state == _settle.STATE_CLEAR] = _settle.STATE_COMPLEX
@@ -582,9 +595,12 @@ class Shader:
 
     def _settle_tiles(
         self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, counts: IntArray,
-        found: _Settled, task: _Task, limit: int, *, list_first: bool = False,
+        found: _Settled, task: _Task, limit: int, load: int, *, list_first: bool = False,
     ) -> None:  # fmt: skip
-        """Settle tiles by their candidates, cutting up to ``limit``: as listed in ``counts`` or as shafts find them."""
+        """Settle tiles by their candidates, cutting up to ``limit``: as listed in ``counts`` or as shafts find them.
+
+        ``load`` points are asked, about: so few that one thread settles them, or more.
+        """
         geo = self.geometry
         count = len(counts)
         lists = np.empty((count if list_first else 0, _settle.MAX_CANDIDATES), dtype=np.int64)
@@ -607,7 +623,7 @@ class Shader:
             )  # fmt: skip
             return tally
 
-        for tally in self._blocks(work, count, min(64, -(-len(tiles.points) // BLOCK_POINTS))):
+        for tally in self._blocks(work, count, min(64, -(-load // BLOCK_POINTS))):
             if task.method in _UNCULLED:
                 task.counters.add(closed_forms=tally[CLOSED])
             else:
@@ -632,7 +648,7 @@ class Shader:
         """
         waiting = np.flatnonzero(found.state == _settle.STATE_COMPLEX)
         allowed = self._allowed(found.part, waiting, pilot.mean, task)
-        worth = RAY_NS * pilot.rays(MARGIN * ALONE_NOISE * allowed)
+        worth = (VOXEL_NS if self._through.any() else RAY_NS) * pilot.rays(MARGIN * ALONE_NOISE * allowed)
         allowed *= LINE_MARGIN
         tile = tiles.of(waiting)
         chosen, first, held = np.unique(tile, return_index=True, return_counts=True)
@@ -640,22 +656,22 @@ class Shader:
         flat = (tiles.normal[chosen] != 0.0).any(axis=1)
         rayed = np.where(flat, np.minimum(worth * held, worth * few + FIT_NS * held), worth * held)
         lined = TILE_NS + POINT_NS * few
-        if CROWD_LIMIT > CUT_LIMIT and (held * CUT_NS < np.minimum(rayed, lined)).any():
-            begin = time.perf_counter()
-            cut = np.where(held * (CUT_NS + KEPT_NS) < np.minimum(rayed, lined), 0.0, np.inf)
-            for part in (2, 4, 1):  # its middle, and if there is hope more of it
-                asked = np.flatnonzero(cut < np.inf)
-                some = waiting[np.minimum(first + held // part, first + held - 1)[asked]]
-                kept = self._crowds(tiles, ring, normal, owners, own, some, task)
-                price = np.where(kept <= CROWD_LIMIT, CUT_NS + KEPT_NS * kept, np.inf)
-                cut[asked] += held[asked] * price / 3.0
-            short = cut < np.minimum(rayed, lined)
-            counts = np.full(len(tiles.start) - 1, _settle.PASSED, dtype=np.int64)
-            counts[chosen[short]] = -1
-            self._settle_tiles(tiles, ring, normal, owners, own, counts, found, task, CROWD_LIMIT)
-            chosen = np.unique(tiles.of(np.flatnonzero(found.state == _settle.STATE_COMPLEX)))
-            rayed = rayed[np.isin(np.unique(tile), chosen)]
-            task.seconds["crowds"] = task.seconds.get("crowds", 0.0) + time.perf_counter() - begin
+        other = np.minimum(rayed, lined)
+        cut = np.where((held * CUT_NS < other) & (CROWD_LIMIT > CUT_LIMIT), 0.0, np.inf)
+        begin = time.perf_counter()
+        for parts in ((0.5,), (0.2, 0.8)):  # the middle of each tile, and more of it where there is hope
+            hopeful = np.flatnonzero(cut < other)
+            if len(hopeful):
+                rows = [waiting[first[hopeful] + (held[hopeful] * part).astype(np.int64)] for part in parts]
+                kept = self._crowds(tiles, ring, normal, owners, own, np.concatenate(rows), task)
+                price = np.where(kept <= CROWD_LIMIT, CUT_NS + KEPT_NS * kept, np.inf).reshape(len(parts), -1)
+                cut[hopeful] += held[hopeful] * price.sum(axis=0) / 3.0
+        short = chosen[cut < other]
+        if len(short):
+            self._cut_tiles(tiles, ring, normal, owners, own, short, found, task, int(held.sum()))
+            left = np.isin(chosen, np.unique(tiles.of(np.flatnonzero(found.state == _settle.STATE_COMPLEX))))
+            chosen, rayed = chosen[left], rayed[left]
+        task.seconds["crowds"] = task.seconds.get("crowds", 0.0) + time.perf_counter() - begin
         ready = ring.tobytes() in self._frames
         if len(chosen) and rayed.sum() > self.geometry.piece_count * (PREPARED_NS if ready else PREPARE_NS):
             begin = time.perf_counter()
@@ -673,6 +689,15 @@ class Shader:
         mean = (known + float((share * found.part[some]).mean()) * len(waiting)) / len(found.state)
         return _Pilot(mean, math.sqrt(float((doubt**2).mean())))
 
+    def _cut_tiles(
+        self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, chosen: IntArray,
+        found: _Settled, task: _Task, load: int,
+    ) -> None:  # fmt: skip
+        """Cut long lists at the ``load`` points of chosen tiles that wait."""
+        counts = np.full(len(tiles.start) - 1, _settle.PASSED, dtype=np.int64)
+        counts[chosen] = -1
+        self._settle_tiles(tiles, ring, normal, owners, own, counts, found, task, CROWD_LIMIT, load)
+
     def _crowds(
         self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, some: IntArray,
         task: _Task,
@@ -681,9 +706,7 @@ class Shader:
         trial = _Settled.empty(len(tiles.points))
         trial.state[:] = _settle.STATE_CLEAR
         trial.state[some] = _settle.STATE_COMPLEX
-        counts = np.full(len(tiles.start) - 1, _settle.PASSED, dtype=np.int64)
-        counts[tiles.of(some)] = -1
-        self._settle_tiles(tiles, ring, normal, owners, own, counts, trial, task, CROWD_LIMIT)
+        self._cut_tiles(tiles, ring, normal, owners, own, np.unique(tiles.of(some)), trial, task, len(some))
         return np.where(trial.state[some] == _settle.STATE_COMPLEX, CROWD_LIMIT + 1, trial.candidates[some])
 
     def _frame(self, ring: FloatArray, normal: FloatArray) -> SenderFrame:
@@ -729,11 +752,6 @@ class Shader:
         # Each block makes marks for all pieces.
         for tally in self._blocks(work, len(chosen), min(8 * self.workers, max(self.workers, len(chosen) // 4))):
             add_tally(task.counters, tally)
-        left = np.unique(tiles.of(np.flatnonzero(found.state == _settle.STATE_COMPLEX)))
-        if len(left):
-            counts = np.full(len(tiles.start) - 1, _settle.PASSED, dtype=np.int64)
-            counts[left] = -1
-            self._settle_tiles(tiles, ring, normal, owners, own, counts, found, task, CUT_LIMIT)
 
     @staticmethod
     def _allowed(part: FloatArray, waiting: IntArray, mean: float, task: _Task) -> float:
@@ -818,31 +836,45 @@ class Shader:
         check = task.method == "rays+plane-vertex"
         return _sampled.woo_shares(self.grid, bundle, ring, normal, polygon, check, task.counters)
 
+    def _smooth_sides(
+        self, tiles: Tiles, chosen: IntArray, ring: FloatArray, normal: FloatArray, polygon: int, task: _Task
+    ) -> FloatArray:
+        """Sides (k,) of the squares of tiles over which the light blurs what lies between the nodes of a fit."""
+        sides = np.empty(len(chosen))
+        _settle.smooth_sides(
+            chosen, tiles.bounds, tiles.normal, tiles.offset, tiles.polygon, ring, ring.min(axis=0), ring.max(axis=0),
+            normal, polygon, sender_width(ring, normal), self.geometry.piece_polygon, *self._tree, task.slack, sides,
+        )  # fmt: skip
+        return sides * (BLUR / NODE_GAP)
+
     def _trace(
         self, tiles: Tiles, waiting: IntArray, ring: FloatArray, normal: FloatArray, polygon: int, part: FloatArray,
         seen: FloatArray, doubt: FloatArray, pilot: _Pilot | None, task: _Task,
     ) -> None:  # fmt: skip
         """Rays at the points that are left, all of them or as many as a smooth fit needs."""
 
-        def sample(rows: IntArray, count: int) -> tuple[FloatArray, FloatArray]:
-            return self._sample(tiles, rows, count, ring, normal, polygon, task)
+        def sample(rows: IntArray, error: float) -> tuple[FloatArray, FloatArray]:
+            assert pilot is not None
+            return self._sample(tiles, waiting[rows], pilot.rays(error), ring, normal, polygon, task)
 
         count = task.samples
         if pilot is not None:
             # The error is asked of the irradiance over all points: what may a share here be off by?
             allowed = MARGIN * self._allowed(part, waiting, pilot.mean, task)
             count = pilot.rays(ALONE_NOISE * allowed)
-        if pilot is not None and RAY_NS * count > FIT_NS:
+        fitted = False
+        if pilot is not None:
             # Rows of the complex points only, tile by tile.
             tile = tiles.of(waiting)
             edges = np.concatenate([[0], np.flatnonzero(np.diff(tile)) + 1, [len(waiting)]])
+            spared = int(np.maximum(np.diff(edges) - RAYED, 0).sum())
+            fitted = RAY_NS * count * spared > FILL_NS + FIT_NS * len(waiting)
+        if fitted:
             share, spread = np.zeros(len(waiting)), np.zeros(len(waiting))
-            fill_smoothly(
-                tiles.flat[waiting], edges[:-1], edges[1:], lambda rows, to: sample(waiting[rows], _rays_for(to)),
-                share, spread, error=allowed,
-            )  # fmt: skip
+            sides = self._smooth_sides(tiles, tile[edges[:-1]], ring, normal, polygon, task)
+            fill_smoothly(tiles.flat[waiting], edges[:-1], edges[1:], sides, sample, share, spread, error=allowed)
         else:
-            share, spread = sample(waiting, count)
+            share, spread = self._sample(tiles, waiting, count, ring, normal, polygon, task)
         seen[waiting] += share * part[waiting]
         doubt[waiting] += spread * part[waiting]
 

@@ -35,7 +35,18 @@ from workbench.shadow._tile_fit import NODE_GAP, NODES, TERMS, cubic_at, cut_run
 from workbench.shadow.rays import shift
 from workbench.shadow.tiles import DIFFERENT
 
-__all__ = ["FIT_NS", "LINE_NOISE", "MAX_LINES", "RAYED", "RAY_NS", "EdgeTable", "SenderFrame", "line_tiles"]
+__all__ = [
+    "BLUR",
+    "FIT_NS",
+    "LINE_NOISE",
+    "MAX_LINES",
+    "RAYED",
+    "RAY_NS",
+    "EdgeTable",
+    "SenderFrame",
+    "line_tiles",
+    "sender_width",
+]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -60,9 +71,9 @@ BLUR = 0.5
 """Share of the sender's width by which edges may move over it from one node of a fit to the next."""
 CROWDED = 512
 """Edges that make a list long."""
-RAY_NS, PIECE_NS, EDGE_NS, LOOSE_NS, LINE_NS = 90.0, 150.0, 8.0, 180.0, 80.0
-"""Measured nanoseconds of a ray, of a piece met by the shaft of a tile, and of what a point looks at: an edge, a
-piece that reaches its height or the sender's plane, a line.  Only their ratios matter."""
+RAY_NS, PIECE_NS, EDGE_NS, LOOSE_NS, LINE_NS = 90.0, 250.0, 8.0, 180.0, 80.0
+"""Measured nanoseconds of a ray, of a piece met by the shaft of a tile with all that follows from it, and of what a
+point looks at: an edge, a piece that reaches its height or the sender's plane, a line.  Only their ratios matter."""
 RAYED, FIT_NS = 64, 1000.0
 """Points of a flat tile that get rays where a fit takes the others, about, and nanoseconds of each of these."""
 CROSSINGS = 128
@@ -138,7 +149,7 @@ class EdgeTable:
         )
 
 
-def _width(ring: FloatArray, normal: FloatArray) -> float:
+def sender_width(ring: FloatArray, normal: FloatArray) -> float:
     """Least distance of parallel lines that a convex polygon lies between."""
     sides = np.roll(ring, -1, axis=0) - ring
     across = np.cross(normal, sides[np.linalg.norm(sides, axis=1) > 0.0])
@@ -199,7 +210,7 @@ class SenderFrame:
             np.column_stack([np.minimum.reduceat(height, first), np.maximum.reduceat(height, first)])
             if len(first)
             else np.empty((0, 2)),
-            _width(ring, normal),
+            sender_width(ring, normal),
         )
 
 
@@ -765,7 +776,7 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
     ``worth`` nanoseconds a point, would be cheaper.
     """
     points, normals, index, own, flat, tile_start, tile_bounds, tile_normal, tile_offset, tile_own = tiles
-    corners, sender_low, sender_high, sender_normal, sender_own, sender_width = sender
+    corners, sender_low, sender_high, sender_normal, sender_own, width = sender
     _, piece_polygon, through, _, _, ends, _, _ = table
     origin, axes, ring, place, plane, height = frame
     low, high, skip, head, leaf, order, bounds = tree
@@ -913,7 +924,7 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
             dear = edges > group_room or looks * (edges * EDGE_NS + close * LOOSE_NS + fewest * LINE_NS) > worth
             if fitted:
                 count = 0
-                if not dear and _blurred(box, highest, ring_box, sender_width):
+                if not dear and _blurred(box, highest, ring_box, width):
                     count = pick_nodes(flat, rows, a, b, region, nodes)
                 if count == 0:
                     top = quarter(flat, rows, a, b, spare, stack, top)

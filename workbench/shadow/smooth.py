@@ -63,6 +63,7 @@ def fill_smoothly(
     flat: FloatArray,
     start: IntArray,
     stop: IntArray,
+    sides: FloatArray,
     sample: Callable[[IntArray, float], tuple[FloatArray, FloatArray]],
     share: FloatArray,
     doubt: FloatArray,
@@ -77,6 +78,8 @@ def fill_smoothly(
         Places of the points on their plane; reordered views are made inside, rows keep their numbers.
     start, stop : (t,) int
         Tile ``t`` is rows ``start[t]:stop[t]``.
+    sides : (t,) float
+        Longest side of a part of the tile that may be fitted: over a longer one small shadows slip between the nodes.
     sample : callable
         Shares at the given rows, to a given error, and their standard errors.
     share, doubt : (n,) float
@@ -104,7 +107,7 @@ def fill_smoothly(
             share[direct], doubt[direct] = sample(direct, ALONE_NOISE * error)
             sampled += len(direct)
         keep = ~small[tile]
-        rows, sizes = rows[keep], sizes[~small]
+        rows, sizes, sides = rows[keep], sizes[~small], sides[~small]
         if not len(rows):
             break
         edges = np.concatenate([[0], np.cumsum(sizes)])
@@ -114,7 +117,7 @@ def fill_smoothly(
         place = (flat[rows] - middle[tile]) / half[tile]
         chosen = np.empty((len(sizes), NODES), dtype=np.int64)
         _nearest_points(place, edges[:-1], edges[1:], _NODES, chosen)
-        usable = (chosen >= 0).sum(axis=1) >= NODES - 2
+        usable = ((chosen >= 0).sum(axis=1) >= NODES - 2) & (2.0 * half.max(axis=1) <= sides)
         spot = np.where(chosen >= 0, chosen, edges[:-1, None])
         known = chosen >= 0
         values, noise = np.zeros(chosen.shape), np.zeros(chosen.shape)
@@ -147,5 +150,6 @@ def fill_smoothly(
         quarter = tile * 4 + (place[:, 0] > 0) * 2 + (place[:, 1] > 0)
         order = np.argsort(quarter, kind="stable")
         rows = rows[order]
-        _, sizes = np.unique(quarter, return_counts=True)
+        kinds, sizes = np.unique(quarter, return_counts=True)
+        sides = sides[kinds // 4]
     return sampled
