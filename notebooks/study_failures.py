@@ -12,7 +12,8 @@
 # %%
 import matplotlib.pyplot as plt
 
-from radiosity.report.failures import CATALOGUE, contour_factor, judge, point_irradiance
+from radiosity.report.catalogue import CATALOGUE
+from radiosity.report.failures import contour_factor, judge, point_irradiance
 from radiosity.stability_command import draw_matrix, run_catalogue
 
 groups = (

@@ -43,7 +43,7 @@ def stability(directory: Path | None, only: str | None, listing: bool) -> None:
     its documentation names the case; or "WRONG".  DIR gets stability.csv, stability.png and
     record.json.  The exit code is 1 if any cell is wrong.
     """
-    from radiosity.report.failures import CATALOGUE
+    from radiosity.report.catalogue import CATALOGUE
     from workbench.record import check_folder
 
     chosen = _chosen(CATALOGUE, only)
@@ -52,6 +52,7 @@ def stability(directory: Path | None, only: str | None, listing: bool) -> None:
             click.echo(f"{entry.group:30s} {entry.name:36s} {entry.about}")
         return
     check_folder(directory)
+    chosen, notes = _present(chosen)
     from workbench.record import RunRecord
     from workbench.study.result import format_table
 
@@ -60,12 +61,14 @@ def stability(directory: Path | None, only: str | None, listing: bool) -> None:
         matrix = run_catalogue(chosen)
     click.echo(format_table(_rows(chosen, matrix)))
     click.echo()
-    for line in _reasons(chosen, matrix):
+    for line in (*_reasons(chosen, matrix), *notes):
         click.echo(line)
-    counts = {verdict: sum(cell.verdict == verdict for cell in matrix.values()) for verdict in VERDICTS}
+    counts, theirs = _counts(matrix)
     click.echo(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+    if any(theirs.values()):
+        click.echo("rivals: " + ", ".join(f"{count} {verdict}" for verdict, count in theirs.items()))
     if directory is not None:
-        record.results = {"counts": counts, "cells": _table(chosen, matrix)}
+        record.results = {"counts": counts, "rivals": theirs, "notes": notes, "cells": _table(chosen, matrix)}
         _write(directory, chosen, matrix, record)
     if counts["wrong"]:
         raise SystemExit(1)
@@ -82,6 +85,30 @@ def _chosen(catalogue: Sequence[Failure], only: str | None) -> list[tuple[Failur
     if not chosen:
         raise OptionError(f"--only: found {only!r}, expected part of a name that 'radiosity stability --list' shows")
     return chosen
+
+
+def _present(chosen: list[tuple[Failure, list[str]]]) -> tuple[list[tuple[Failure, list[str]]], list[str]]:
+    """The same without rivals that cannot run here, and why each cannot."""
+    from radiosity.rivals import RIVALS, absent
+
+    asked = [name for name in RIVALS if any(name in techniques for _, techniques in chosen)]
+    missing = {name: reason for name in asked if (reason := absent(name)) is not None}
+    left = [(entry, [name for name in techniques if name not in missing]) for entry, techniques in chosen]
+    notes = [f"{name} is left out: {reason}" for name, reason in missing.items()]
+    if not any(techniques for _, techniques in left):
+        raise InputError("stability: found no technique that can run; " + "; ".join(notes))
+    return [(entry, techniques) for entry, techniques in left if techniques], notes
+
+
+def _counts(matrix: Mapping[tuple[str, str], Cell]) -> tuple[dict[str, int], dict[str, int]]:
+    """Cells by verdict: of our own techniques, and of rivals."""
+    from radiosity.rivals import RIVALS
+
+    ours, theirs = ([c for (_, name), c in matrix.items() if (name in RIVALS) == rival] for rival in (False, True))
+    counts = [
+        {verdict: sum(cell.verdict == verdict for cell in cells) for verdict in VERDICTS} for cells in (ours, theirs)
+    ]
+    return counts[0], counts[1]
 
 
 def run_catalogue(chosen: Sequence[tuple[Failure, Sequence[str]]]) -> dict[tuple[str, str], Cell]:
@@ -102,16 +129,19 @@ def _text(cell: Cell | None) -> str:
     if cell.verdict in ("right", "refuses"):
         return cell.verdict
     size = abs(cell.error)
-    error = f"{100 * size:.2g}%" if math.isfinite(size) else f"{size}"
+    error = f"{100 * size:.2g}%" if 100 * size < 99.5 else f"{100 * size:.0f}%" if math.isfinite(size) else f"{size}"
     return {"degrades": f"degrades {error}", "disclaims": f"disclaims {error}"}.get(cell.verdict, f"WRONG {error}")
 
 
 def _columns(chosen: Sequence[tuple[Failure, Sequence[str]]]) -> list[str]:
     """Techniques, those that answer the same questions side by side."""
+    from radiosity.rivals import RIVALS
+
     families: dict[tuple[str, ...], None] = dict.fromkeys(tuple(entry.techniques) for entry, _ in chosen)
     asked = {technique for _, techniques in chosen for technique in techniques}
     ordered = sorted(families, key=len, reverse=True)
-    return [name for name in dict.fromkeys(n for family in ordered for n in family) if name in asked]
+    names = [name for name in dict.fromkeys(n for family in ordered for n in family) if name in asked]
+    return sorted(names, key=lambda name: name in RIVALS)  # which answer questions of all kinds: at the end
 
 
 def _rows(
@@ -192,8 +222,10 @@ def draw_matrix(
     """Failures down, techniques across, a coloured cell for each pair, into an empty figure."""
     from matplotlib.patches import Patch, Rectangle
 
+    from radiosity.rivals import RIVALS
+
     columns = _columns(chosen)
-    figure.set_size_inches(4.6 + 0.62 * len(columns), 1.9 + 0.27 * len(chosen))
+    figure.set_size_inches(max(4.6 + 0.62 * len(columns), 9.5), 2.6 + 0.27 * len(chosen))
     axes = figure.subplots()
     before = None
     for row, (entry, techniques) in enumerate(chosen):
@@ -208,8 +240,12 @@ def draw_matrix(
             axes.add_patch(Rectangle((column, row), 1, 1, facecolor=colour, edgecolor="white", lw=1))
             if cell.verdict in ("degrades", "disclaims", "wrong") and math.isfinite(cell.error):
                 size = 100 * abs(cell.error)
-                text = f"{size:.2g}%" if size < 99.5 else f"{size:.0f}%"
+                text = f"{size:.2g}%" if size < 99.5 else f"{size:.0f}%" if size < 999.5 else ">999%"
                 axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=7)
+    rivals = sum(name in RIVALS for name in columns)
+    if 0 < rivals < len(columns):
+        axes.axvline(len(columns) - rivals, color="0.35", lw=1.2)
+        axes.text(len(columns) - 0.5 * rivals, len(chosen) + 0.2, "rivals", ha="center", va="top", fontsize=8)
     axes.set_xlim(0, len(columns))
     axes.set_ylim(len(chosen), 0)
     axes.set_yticks([row + 0.5 for row in range(len(chosen))], [entry.name for entry, _ in chosen], fontsize=8)
@@ -217,9 +253,12 @@ def draw_matrix(
     axes.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    wrong = sum(cell.verdict == "wrong" for cell in matrix.values())
-    words = {"right": "right", "degrades": "degrades, and says so: error", "refuses": "refuses, with a reason",
-             "disclaims": "disclaimed in its documentation: error", "wrong": f"wrong silently ({wrong})"}  # fmt: skip
+    ours, theirs = (counts["wrong"] for counts in _counts(matrix))
+    words = {
+        "right": "right", "degrades": "degrades, and says so: error", "refuses": "refuses, with a reason",
+        "disclaims": "disclaimed in its documentation: error",
+        "wrong": f"wrong silently (ours {ours}, rivals {theirs})",
+    }  # fmt: skip
     axes.legend(
         handles=[Patch(facecolor=VERDICTS[verdict], label=text) for verdict, text in words.items()],
         loc="upper left", bbox_to_anchor=(0.0, -0.01), ncols=3, fontsize=8, frameon=False,
