@@ -582,7 +582,7 @@ class Hierarchy:
         self._fields["samples"], self._fields["sample_normals"] = self._samples, self._sample_normals
         self._refresh()
         _sample_nodes(sampled, self.arrays)
-        self.node_count, self.piece_count = count, len(owner)
+        self.node_count, self.piece_count, self._static = count, len(owner), count
         # What is open from the start: all above the surfaces, and all above a polygon worth an element.
         worth = np.ones(len(geometry.polygon_area), dtype=bool)
         for s, surface_record in enumerate(scene.surfaces):
@@ -700,6 +700,20 @@ class Hierarchy:
         tree = self.arrays
         tree.opened[nodes] = 1
         self.leaf_count += int(tree.children[nodes].sum()) - len(nodes)
+
+    @property
+    def split(self) -> IntArray:
+        """Single quads and triangles that were given parts, in the order in which that was done, (k,)."""
+        tree = self.arrays
+        cells = np.flatnonzero(tree.child[: self.node_count] >= self._static)
+        return cells[np.argsort(tree.child[cells], kind="stable")]
+
+    def restore(self, split: IntArray, opened: NDArray) -> None:
+        """Make a fresh tree the one that had been split and opened so."""
+        self._reserve(4 * len(split))
+        self.node_count, self.piece_count = _split_cells(split, self.arrays, self.node_count, self.piece_count)
+        self.arrays.opened[: self.node_count] = opened
+        self.leaf_count = len(self.leaves())
 
     def open_balanced(self, nodes: IntArray, room: float = math.inf) -> NDArray[np.bool_]:
         """Open leaves (distinct), those first that may be taken from; keeps the quadtree of each polygon balanced.

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import Any
@@ -53,13 +53,13 @@ from radiosity.solvers._pairs import (
 )
 from radiosity.solvers._push_pull import deviations, expand, gather, level, pull, push, sort_links, total
 from radiosity.solvers.incident import cosine_directions, incident_irradiance, incident_spread, points_of_elements
-from radiosity.solvers.progressive import remaining_bound
-from radiosity.solvers.solution import EnergyBook, Progress, ProgressEvent, Solution
+from radiosity.solvers.progressive import CHECKPOINT_SECONDS, CHECKPOINT_SHARE, remaining_bound
+from radiosity.solvers.solution import Checkpoint, EnergyBook, Progress, ProgressEvent, Solution
 from workbench.accel.box_tree import BoxTree
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
 from workbench.counters import Counters
 from workbench.culling.tally import add_tally, new_tally
-from workbench.errors import OptionError
+from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.memory import require_memory
 from workbench.record import RunRecord
@@ -104,6 +104,10 @@ PAIR_BYTES = 120
 """Memory that a new pair takes while it is measured, and as a link with both its directions."""
 SMALLEST = 2.0**-14
 """Shortest edge that is split by default, as a share of the scene's size."""
+
+
+_NODE_VALUES = ("bright", "received", "uneven", "detail", "bias")
+"""Arrays (nodes,) that one round leaves for the next."""
 
 
 @dataclass
@@ -266,6 +270,7 @@ class _Solver:
         self.scene, self.geometry, self.record = scene, geometry, record
         self.min_edge, self.direct_in_mesh, self.relative, self.seed = min_edge, direct_in_mesh, relative, seed
         self.max_elements = max_elements
+        self.before = Counters(**record.counters)
         self.counters = Counters()
         self.pool = ThreadPoolExecutor(workers)
         self.workers = workers
@@ -298,6 +303,64 @@ class _Solver:
 
     def close(self) -> None:
         self.pool.shutdown()
+
+    # ---- stopping and going on -----------------------------------------------------------------
+
+    def count(self) -> None:
+        """Put all counts so far into the record."""
+        self.record.counters = Counters()
+        for part in (self.before, self.counters, self.accelerator.counters):
+            self.record.counters.merge(part)
+
+    def state(self, at: _Round) -> dict[str, NDArray]:
+        """All that :meth:`restore` needs, as arrays by name."""
+        tree, unit = self.tree, at.unit if at.unit is not None else np.zeros(0)
+        arrays = {f.name: getattr(self.links, f.name) for f in fields(_Links)}
+        arrays |= {name: getattr(self, name).copy() for name in _NODE_VALUES}
+        return arrays | {
+            "candidates": self.candidates,
+            "tree_split": tree.split,
+            "tree_opened": tree.arrays.opened[: tree.node_count].copy(),
+            "round": np.array([at.done, at.error, *unit]),
+            "bare": self._bare.copy(),
+            **{f"outside_{name}": values.copy() for name, values in self._outside.items()},
+        }
+
+    def restore(self, earlier: Solution) -> _Round:
+        """Go on from an earlier solution's state."""
+        state, tree = earlier.refinement, self.tree
+        assert state is not None
+        try:
+            split, opened = state["tree_split"], state["tree_opened"]
+            room = tree.node_count + 4 * len(split)
+            if len(opened) > room or (len(split) and not 0 <= split.min() <= split.max() < len(opened)):
+                raise ValueError
+            tree.restore(split, opened)
+            self.links = _Links(*(state[f.name] for f in fields(_Links)))
+            for name in _NODE_VALUES:
+                setattr(self, name, state[name])
+            self.candidates, self._bare = state["candidates"], state["bare"]
+            self._outside = {name: state[f"outside_{name}"] for name in self._outside}
+            done, error, *unit = state["round"].tolist()
+            self._weigh()
+            # Solved to the end already, the mesh is that of the leaves.
+            mesh, leaves = earlier.mesh, tree.leaves()
+            same = (
+                np.array_equal(mesh.element_area, tree.arrays.area[leaves])
+                and np.array_equal(mesh.element_centroid, tree.arrays.centroid[leaves])
+                and np.array_equal(mesh.reflectance, self.rho[tree.arrays.surface[leaves]])
+                and np.array_equal(mesh.emission, self.emission[tree.arrays.surface[leaves]])
+            )
+        except (KeyError, ValueError, IndexError):
+            same = False
+        if not same:
+            raise InputError(
+                "resume: the saved solution has another mesh or other materials; give the same scene, or solve without"
+                " resume"
+            )
+        self.before.merge(earlier.record.counters)
+        self.record.seconds.update(earlier.record.seconds)
+        return _Round(int(done), float(error), np.array(unit))
 
     @property
     def levels(self) -> int:
@@ -803,6 +866,8 @@ def solve_hierarchical(
     workers: int = 1,
     seed: int = 0,
     progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
+    resume: Solution | None = None,
 ) -> Solution:
     """Solve a scene over a hierarchy of links.
 
@@ -842,6 +907,11 @@ def solve_hierarchical(
     progress : callable, optional
         Called with a :class:`ProgressEvent` at every frontier; a ``KeyboardInterrupt`` from it ends the
         refinement, and the links there are give the solution.
+    checkpoint : callable, optional
+        Called now and then, after a round of refinement, with the solution so far.
+    resume : Solution, optional
+        Such a solution, or one that was interrupted, to go on from; gone on from the former, the answer is
+        that of an unbroken solve, bit for bit.  One that was finished is solved anew.
 
     Returns
     -------
@@ -853,6 +923,8 @@ def solve_hierarchical(
     ------
     OptionError
         If an option is out of range.
+    InputError
+        If the solution to go on from is of another scene.
     MemoryForecastError
         If the links would not fit in memory.
     """
@@ -877,56 +949,77 @@ def solve_hierarchical(
         max_elements=max_elements,
     )
     try:
-        if max_edge is not None:
+        state = _Round()
+        if resume is not None and resume.refinement is not None:
+            state = solver.restore(resume)
+        elif max_edge is not None:
             solver.divide(max_edge)
         if form_factor_error is None and (max_elements or math.inf) <= solver.tree.leaf_count <= EXACT_ELEMENTS:
             solver.relative = EXACT
-        return _rounds(solver, link_error, tolerance, progress)
+        return _rounds(solver, state, link_error, tolerance, progress, checkpoint)
     finally:
         solver.close()
 
 
-def _errors_of_rounds(solver: _Solver, link_error: float | None) -> Iterable[float]:
-    """Link errors of the rounds, none coarser than the one before."""
+@dataclass
+class _Round:
+    """Where a solve stands between two rounds: those done, the last one's link error, the mean irradiance."""
+
+    done: int = 0
+    error: float = math.inf
+    unit: FloatArray | None = None
+
+
+def _next_error(solver: _Solver, state: _Round, link_error: float | None) -> float | None:
+    """Link error of the next round, none coarser than the one before; None after the last."""
     if link_error is not None:
-        for factor in COARSER:
-            yield factor * link_error
+        if state.done < len(COARSER):
+            return COARSER[state.done] * link_error
+        finer = state.error > link_error
         error = link_error
+    elif state.done < 2:
+        return FIRST_ERROR
     else:
         assert solver.max_elements is not None
-        error = FIRST_ERROR
-        yield error
-        yield error
-        while solver.tree.leaf_count < 0.98 * solver.max_elements and error > LAST_ERROR:
-            error *= 0.5
-            yield error
+        finer = solver.tree.leaf_count < 0.98 * solver.max_elements and state.error > LAST_ERROR
+        error = 0.5 * state.error if finer else state.error
     # Light that goes round more corners than there were rounds.
-    while solver.waiting():
-        yield error
+    return error if finer or solver.waiting() else None
 
 
-def _rounds(solver: _Solver, link_error: float | None, tolerance: float, progress: Progress | None) -> Solution:
+def _rounds(
+    solver: _Solver,
+    state: _Round,
+    link_error: float | None,
+    tolerance: float,
+    progress: Progress | None,
+    checkpoint: Checkpoint | None,
+) -> Solution:
     """Refine and solve, round by round."""
     record, tree = solver.record, solver.tree
     begin = time.perf_counter()
     final = link_error if link_error is not None else LAST_ERROR
+    saved, pause = -math.inf, CHECKPOINT_SECONDS
 
     def report(links: int) -> None:
         if progress is not None:
             seconds = time.perf_counter() - begin
-            progress(ProgressEvent(links, error, final, seconds, f"{tree.leaf_count} elements"))
+            progress(ProgressEvent(links, error or final, final, seconds, f"{tree.leaf_count} elements"))
 
-    unit = _first_light(solver)
     stopped = ""
-    before = math.inf
-    for error in _errors_of_rounds(solver, link_error):
+    solution: Solution | None = None
+    if state.unit is None:
+        state.unit = _first_light(solver)
+    else:
+        with record.stage("solve"):
+            solution, exchange = _solved(solver, limit=1e-3, interrupted=False)
+    while (error := _next_error(solver, state, link_error)) is not None:
         # What the sums of errors will be after this round, about.
-        fall = (error / before) ** FALL
+        fall = (error / state.error) ** FALL
         solver.detail *= fall
         solver.bias *= fall
-        before = error
         try:
-            solver.refine_for_lights(error, unit)
+            solver.refine_for_lights(error, state.unit)
             with record.stage("links"):
                 solver.refine(error, report)
         except KeyboardInterrupt:
@@ -934,11 +1027,22 @@ def _rounds(solver: _Solver, link_error: float | None, tolerance: float, progres
         with record.stage("solve"):
             solution, exchange = _solved(solver, limit=1e-3, interrupted=bool(stopped))
             found = solution.mean_irradiance
-            unit = np.where(found > 0, found, unit)
-            solver.illuminate(solution.radiosity, solution.element_irradiance, exchange, unit)
+            state.unit = np.where(found > 0, found, state.unit)
+            solver.illuminate(solution.radiosity, solution.element_irradiance, exchange, state.unit)
             solver.accumulate(exchange)
+        state.error = error
         if stopped:
             break
+        state.done += 1
+        if checkpoint is not None and time.perf_counter() - saved > pause:
+            start = time.perf_counter()
+            solver.count()
+            solution.refinement = solver.state(state)
+            checkpoint(solution)
+            solution.refinement = None
+            saved = time.perf_counter()
+            pause = max(CHECKPOINT_SECONDS, (saved - start) / CHECKPOINT_SHARE)
+    assert solution is not None
     with record.stage("solve"):
         limit = 1e-3
         while remaining_bound(solution) > tolerance and limit > 1e-15:
@@ -946,6 +1050,8 @@ def _rounds(solver: _Solver, link_error: float | None, tolerance: float, progres
             _solve_links(solver, exchange, solution, limit=limit)
     solution.converged = not stopped
     solution.stopped = stopped or "tolerance"
+    if stopped:
+        solution.refinement = solver.state(state)
     _report(solver, solution, exchange)
     return solution
 
@@ -993,8 +1099,7 @@ def _solved(solver: _Solver, *, limit: float, interrupted: bool) -> tuple[Soluti
 def _report(solver: _Solver, solution: Solution, exchange: _Exchange) -> None:
     """Put what the run knows of its own errors into the record."""
     record, links = solver.record, solver.links
-    record.counters.merge(solver.counters)
-    record.counters.merge(solver.accelerator.counters)
+    solver.count()
     record.seconds["inside embree, summed over threads"] = solver.seconds_in_embree
     record.errors["remaining_bound"] = remaining_bound(solution)
     record.errors["energy_imbalance"] = solution.book.imbalance(solution.unshot_power)

@@ -169,6 +169,8 @@ class Solution:
         Flux per area from lights without surface and from the background. [W m-2]
     shooting : ShootingState, optional
         Progressive refinement's own state.
+    refinement : dict, optional
+        Arrays by name: the state of an unfinished hierarchical solve.
     """
 
     scene: Scene
@@ -182,6 +184,7 @@ class Solution:
     stopped: str = ""
     direct_irradiance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     shooting: ShootingState | None = None
+    refinement: dict[str, NDArray] | None = None
 
     @property
     def unshot_power(self) -> FloatArray:
@@ -330,6 +333,8 @@ class Solution:
         if self.shooting is not None:
             stored = self.shooting.as_arrays(with_kept=not self.converged)
             arrays |= {f"shooting_{name}": values for name, values in stored.items()}
+        if self.refinement is not None:
+            arrays |= {f"refinement_{name}": values for name, values in self.refinement.items()}
         beside = directory / f".solution.{os.getpid()}.part.npz"
         try:
             np.savez(
@@ -369,8 +374,10 @@ class Solution:
             names = ("emitted", "shot", "received", "absorbed", "escaped")
             book = EnergyBook(*(arrays[f"book_{k}"] for k in names))
             values = [arrays[k] for k in ("radiosity_W_m2", "irradiance_W_m2", "unshot_W_m2", "direct_irradiance_W_m2")]
-            prefix = "shooting_"
-            stored = {name[len(prefix) :]: array for name, array in arrays.items() if name.startswith(prefix)}
+            stored, refinement = (
+                {name[len(prefix) :]: array for name, array in arrays.items() if name.startswith(prefix)}
+                for prefix in ("shooting_", "refinement_")
+            )
             shooting = ShootingState.from_arrays(stored) if stored else None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path}: found no readable solution ({error}); solve the scene again") from None
@@ -396,4 +403,5 @@ class Solution:
             stopped=str(state["stopped"]),
             direct_irradiance=values[3],
             shooting=shooting,
+            refinement=refinement or None,
         )

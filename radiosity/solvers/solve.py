@@ -275,6 +275,8 @@ def solve(
             workers=count,
             seed=seed,
             progress=progress,
+            checkpoint=checkpoint,
+            resume=resume,
         )
     with record.stage("mesh"):
         whole = method in FULL

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from radiosity.form_factors.analytic import point_to_polygon
 from radiosity.hierarchy import Hierarchy
 from radiosity.solvers import hierarchical
 from workbench import memory
-from workbench.errors import MemoryForecastError, OptionError
+from workbench.errors import InputError, MemoryForecastError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.record import RunRecord
 from workbench.scene.library import box_surface, diffuse, sphere_surface, unit_cube
@@ -408,6 +409,67 @@ def test_ctrl_c_leaves_a_usable_solution():
     assert solution.book.imbalance(solution.unshot_power) < 1e-12
     means = [np.average(s.element_irradiance[:, 0], weights=s.mesh.element_area) for s in (solution, whole)]
     assert 0.2 < means[0] / means[1] < 2.0
+
+
+class Killed(BaseException):
+    """What no solver catches."""
+
+
+@pytest.mark.parametrize("options", [{"link_error": 5e-3}, {"elements": 600}, {"link_error": 0.02, "max_edge": 0.4}])
+@pytest.mark.parametrize("after", [1, 3])
+def test_a_solve_that_was_killed_goes_on_to_the_same_bits(after, options, tmp_path, monkeypatch):
+    monkeypatch.setattr(hierarchical, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(hierarchical, "CHECKPOINT_SHARE", math.inf)
+    scene = room_with_ball()
+    whole = solve(scene, **options)
+    seen = []
+
+    def save_and_die(solution):
+        seen.append(solution)
+        solution.save_state(tmp_path)
+        if len(seen) == after:
+            raise Killed
+
+    with pytest.raises(Killed):
+        solve(scene, checkpoint=save_and_die, **options)
+    unfinished = radiosity.Solution.load(tmp_path)
+    assert not unfinished.converged and unfinished.mesh.element_count <= whole.mesh.element_count
+    again = solve(scene, resume=unfinished, workers=2, **options)
+    assert again.converged
+    assert np.array_equal(again.radiosity, whole.radiosity)
+    assert np.array_equal(again.mesh.corners, whole.mesh.corners)
+    assert dict(again.record.counters) == dict(whole.record.counters)
+    assert again.record.errors == whole.record.errors
+
+
+def test_an_interrupted_solve_goes_on(tmp_path):
+    scene = room_with_ball()
+    whole = solve(scene, link_error=5e-3)
+    events = []
+
+    def stop(event):
+        events.append(event)
+        if len(events) == 12:
+            raise KeyboardInterrupt
+
+    solve(scene, link_error=5e-3, progress=stop).save(tmp_path)
+    again = solve(scene, link_error=5e-3, resume=radiosity.Solution.load(tmp_path))
+    assert again.converged and again.stopped == "tolerance"
+    area = whole.mesh.element_area.sum()
+    means = [s.mesh.element_area @ s.element_irradiance[:, 0] / area for s in (again, whole)]
+    assert means[0] == pytest.approx(means[1], rel=0.01)
+    assert again.mesh.element_count == pytest.approx(whole.mesh.element_count, rel=0.2)
+
+
+def test_going_on_with_another_scene_is_refused(tmp_path):
+    def stop(event):
+        raise KeyboardInterrupt
+
+    solve(room_with_ball(), link_error=5e-3, progress=stop).save(tmp_path)
+    unfinished = radiosity.Solution.load(tmp_path)
+    for other in (cube_with_emitter(0.2, 0.7), standing_box(), workbench.load("cornell-box")):
+        with pytest.raises(InputError, match="resume: the saved solution has another mesh"):
+            solve(other, link_error=5e-3, resume=unfinished)
 
 
 def test_links_that_do_not_fit_in_memory_are_refused(monkeypatch):
