@@ -12,7 +12,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache, cached_property
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +32,6 @@ from workbench.culling.tally import add_tally, new_tally
 from workbench.errors import InputError, OptionError
 from workbench.geometry.coplanar import Occluders, join_coplanar
 from workbench.geometry.flat import Geometry
-from workbench.geometry.polygons import plane_basis
 from workbench.memory import require_memory
 from workbench.record import RunRecord
 from workbench.scene.model import Scene
@@ -76,6 +77,12 @@ _TRIANGLE_6 = (
 """D. A. Dunavant, "High degree efficient symmetrical Gaussian quadrature rules for the triangle" (1985)."""
 
 
+@cache
+def _triangle_rule(level: int) -> tuple[FloatArray, FloatArray]:
+    """Three points on each of the ``4**level`` parts of a triangle."""
+    return _split_triangle(_TRIANGLE_3, level)
+
+
 def _split_triangle(rule: tuple[FloatArray, FloatArray], level: int) -> tuple[FloatArray, FloatArray]:
     """A rule of barycentric points on each of the ``4**level`` parts of a triangle."""
     cells = [np.eye(3)]
@@ -90,6 +97,7 @@ def _quarters(cell: FloatArray) -> list[FloatArray]:
     return [np.stack(part) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
 
 
+@cache
 def _gauss_square(points: int, cells: int) -> tuple[FloatArray, FloatArray]:
     """A product Gauss rule on each of ``cells`` x ``cells`` parts of the unit square: (n, 2) and weights."""
     x, w = np.polynomial.legendre.leggauss(points)
@@ -339,11 +347,10 @@ def _build_tree(pieces: _Pieces) -> tuple[_Tree, IntArray]:
 def _occluder_frames(occluders: Occluders) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Of each occluder its plane's frame (origin, u, v), flat corners, and their lowest and highest (u, v)."""
     count = occluders.count
-    frame = np.zeros((count, 9))
-    for k in range(count):
-        u, v = plane_basis(occluders.normal[k])
-        frame[k, 3:6], frame[k, 6:] = u, v
-    frame[:, :3] = occluders.corners[occluders.start[:-1]]
+    # As plane_basis, all at once.
+    u = np.cross(np.eye(3)[np.argmin(np.abs(occluders.normal), axis=1)], occluders.normal)
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    frame = np.hstack([occluders.corners[occluders.start[:-1]], u, np.cross(occluders.normal, u)])
     ring = np.repeat(np.arange(count), np.diff(occluders.start))
     off = occluders.corners - frame[ring, :3]
     flat = np.stack([np.einsum("ij,ij->i", off, frame[ring, 3:6]), np.einsum("ij,ij->i", off, frame[ring, 6:])], axis=1)
@@ -396,6 +403,10 @@ class _Stripe(NamedTuple):
     rays: int
     refined: int
 
+    def merged(self, rows: int) -> _Stripe:
+        """The same with pairs of the same rows added up."""
+        return _Stripe(*_merged(self.row, self.column, self.value, self.error, rows), *self[4:])
+
 
 class _Engine:
     """What the stripes of one matrix share: arrays, settings, threads' scratch."""
@@ -407,14 +418,11 @@ class _Engine:
         self.pieces = _reordered(pieces, order)
         self.care, self.seed = care, seed
         self.geometry = geometry
-        self.tracer: EmbreeAccelerator | None = None
+        self._building = Lock()
         p, t, o = self.pieces, self.tree, self.occluders
         frame, flat, flow, fhigh = _occluder_frames(o)
         levels = [_rule_points(p, _CENTROID, _gauss_square(1, 1))]
-        levels += [
-            _rule_points(p, _split_triangle(_TRIANGLE_3, k), _gauss_square(2, 2**k))
-            for k in range(max(care.levels - 1, 1))
-        ]
+        levels += [_rule_points(p, _triangle_rule(k), _gauss_square(2, 2**k)) for k in range(max(care.levels - 1, 1))]
         ends = np.cumsum([0] + [len(points) for _, points in levels])
         points = np.concatenate([points for _, points in levels])
         level_starts = np.stack([start + end for (start, _), end in zip(levels, ends[:-1], strict=True)])
@@ -489,14 +497,13 @@ class _Engine:
     def _by_rays(
         self, pairs: IntArray, base: int, out: FloatArray, spread: FloatArray, importance: FloatArray, threshold: float
     ) -> int:
-        assert self.tracer is not None
         i, j = pairs[:, 0], pairs[:, 1]
         whole = out[i - base, j]
         smaller = np.minimum(self.pieces.area[i], self.pieces.area[j])
         goals = self.care.share_error * (1.0 + self.care.floor * smaller / whole)
         goals = np.minimum(goals, threshold / (whole * (importance[i] + importance[j])))
         most = MOST_RAYS if threshold == math.inf else 64 * MOST_RAYS
-        share, doubt, traced = ray_shares(pairs, goals, self.seed, self.pieces, self.tracer, most)
+        share, doubt, traced = ray_shares(pairs, goals, self.seed, self.pieces, self.tracer(), most)
         out[i - base, j] = whole * share
         spread[i - base, j] = spread[i - base, j] * share + whole * doubt
         return traced
@@ -516,9 +523,14 @@ class _Engine:
         found[row_of[asked[out]]] = True
         return found
 
-    def prepare_rays(self) -> None:
-        """Build Embree's tree before threads need it."""
-        self.tracer = EmbreeAccelerator(self.geometry)
+    @cached_property
+    def _tracer(self) -> EmbreeAccelerator:
+        return EmbreeAccelerator(self.geometry)
+
+    def tracer(self) -> EmbreeAccelerator:
+        """Embree, built when the first thread needs it."""
+        with self._building:
+            return self._tracer
 
 
 def close_rows(exchange: Matrix, wanted: FloatArray) -> FloatArray:
@@ -785,7 +797,12 @@ def view_factors(
     if not any(surface.face_count for surface in scene.surfaces):
         raise InputError(f"{where}: found no surface; add a [[surface]] to the scene")
     advice = "ask for fewer elements, a larger max_edge, or by='surface'"
-    count = float(forecast_elements(scene, max_edge or math.inf, 1)) if elements is None else float(elements)
+    if elements is not None:
+        count = float(elements)
+    elif max_edge is not None:
+        count = float(forecast_elements(scene, max_edge, 1))
+    else:
+        count = float(sum(surface.face_count for surface in scene.surfaces))
     require_memory(3000.0 * count, f"a mesh of {count:.3g} elements", advice)
     record = RunRecord(
         "viewfactors",
@@ -810,7 +827,6 @@ def view_factors(
         n = pieces.count
         needed = _forecast(len(names), _facing_share(pieces, seed), threads)
         require_memory(needed, f"a matrix of {len(names)} x {len(names)} view factors", advice)
-        engine.prepare_rays()
     with record.stage("exchange areas"):
         exchange, spread = _all_exchanges(engine, row_of[pieces.owner], areas, threads, record, progress, error)
     with record.stage("close"):
@@ -854,9 +870,7 @@ def exchange_areas(
     n = mesh.element_count
     engine = _Engine(_Elements.of_mesh(mesh), geometry, _Care.for_error(error, n, loose=False), seed)
     require_memory(3.0 * DENSE_ENTRY * n**2, f"a matrix of {n} x {n} form factors", "ask for fewer elements")
-    engine.prepare_rays()
-    found = _all_exchanges(engine, engine.pieces.owner, mesh.element_area, workers, record, progress, dense=True)
-    return found
+    return _all_exchanges(engine, engine.pieces.owner, mesh.element_area, workers, record, progress, dense=True)
 
 
 def _all_exchanges(
@@ -881,17 +895,17 @@ def _all_exchanges(
 
     def run(stripes: list[int], threshold: float) -> None:
         done = 0
-        each = pool.map(lambda node: engine.stripe(node, row_of, importance, threshold), stripes)
-        for node, stripe in zip(stripes, each, strict=True):
+        results = each(lambda node: engine.stripe(node, row_of, importance, threshold), stripes)
+        for node, stripe in zip(stripes, results, strict=True):
             add_tally(record.counters, stripe.tally)
             record.counters.add(rays=stripe.rays)
             # Several pieces a row: add up what belongs together at once.
-            found[node] = stripe if rows == n else _Stripe(*_merged(*stripe[:4], rows), *stripe[4:])
+            found[node] = stripe if rows == n else stripe.merged(rows)
             done += int((tree.last[node] - tree.first[node]) * (2 * n - tree.first[node] - tree.last[node]))
             if progress is not None and threshold == math.inf:
                 progress(min(done / n**2, 1.0))
 
-    with _threads(threads) as pool:
+    with _threads(threads, n) as each:
         run(tree.stripes.tolist(), math.inf)
         for _ in range(REFINEMENTS):
             stated = _stated(list(found.values()), areas)
@@ -907,7 +921,7 @@ def _all_exchanges(
         if rows < n:
             r, c, value, doubt = (np.concatenate([part[k] for part in parts]) for k in range(4))
             parts = [_merged(r, c, value, doubt, rows)]
-        return _symmetric(parts, rows, pool.map, dense)
+        return _symmetric(parts, rows, each, dense)
 
 
 def _merged(
@@ -949,11 +963,17 @@ def _above(bins: FloatArray, threshold: float) -> bool:
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[ThreadPoolExecutor]:
-    """A pool whose waiting work is dropped when something stops it."""
+def _threads(count: int, pieces: int) -> Iterator[Callable[..., Any]]:
+    """``map`` over a pool of threads, whose waiting work is dropped when something stops it.
+
+    Few pieces are done before threads have started.
+    """
+    if count == 1 or pieces <= STRIPE:
+        yield map
+        return
     pool = ThreadPoolExecutor(count)
     try:
-        yield pool
+        yield pool.map
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -1067,10 +1087,10 @@ def _finished(
     sums, stated, doubt, closed_sums = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     worst = np.zeros((n, 3))
     x = np.ones(n)
-    with _threads(threads) as pool:
+    with _threads(threads, n) as pool:
 
         def each(work: Callable[[int, int], None]) -> None:
-            list(pool.map(lambda block: work(*block), _blocks(n)))
+            list(pool(lambda block: work(*block), _blocks(n)))
 
         each(lambda first, last: _row_sums(first, last, start, data, errors, areas, sums, stated, doubt))
         record.errors["stated_row_error_as_found"] = float(stated.mean())

@@ -53,7 +53,6 @@ def exchanges(scene, error=2e-2):
     geometry = Geometry.from_scene(scene)
     elements = _Elements.of_polygons(geometry)
     engine = _Engine(elements, geometry, _Care.for_error(error, elements.element_count), 0)
-    engine.prepare_rays()
     found = {}
     owner = engine.pieces.owner.astype(np.int32)
     for node in engine.tree.stripes.tolist():
