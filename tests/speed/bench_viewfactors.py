@@ -33,8 +33,8 @@ def _ours(triangles: int, error: float, workers: int):
     start, work = time.perf_counter(), time.process_time()
     found = radiosity.view_factors(scene, error=error, workers=workers)
     spent = time.perf_counter() - start, time.process_time() - work
-    stated = found.standard_error if not found.sparse else found.standard_error.toarray()
-    return found.dense(), spent, {"stated": float(stated.sum(axis=1).mean()), "found_sums": found.row_sums}
+    more = {"stated": found.record.errors["stated_row_error"], "found_sums": found.row_sums, "peak_MiB": _peak()}
+    return found.dense(), spent, more
 
 
 def _pyviewfactor(triangles: int, error: float, workers: int):
@@ -50,7 +50,13 @@ def _pyviewfactor(triangles: int, error: float, workers: int):
     start, work = time.perf_counter(), time.process_time()
     # Its F[i, j] goes from face j to face i.
     factor = np.ascontiguousarray(compute_viewfactor_matrix(large, obstacles=large).T)
-    return factor, (time.perf_counter() - start, time.process_time() - work), {"found_sums": factor.sum(axis=1)}
+    spent = time.perf_counter() - start, time.process_time() - work
+    return factor, spent, {"found_sums": factor.sum(axis=1), "peak_MiB": _peak()}
+
+
+def _peak() -> float:
+    """Most memory of this process until now: comparing matrices comes after."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 METHODS = {"ours": _ours, "pyviewfactor": _pyviewfactor}
@@ -58,14 +64,12 @@ METHODS = {"ours": _ours, "pyviewfactor": _pyviewfactor}
 
 def _child(method: str, triangles: int, error: float, workers: int, path: str) -> None:
     factor, (seconds, work), more = METHODS[method](triangles, error, workers)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     np.save(path, factor)
     sums = more.pop("found_sums")
     json.dump(
         {
             "seconds": seconds,
             "processor": work,
-            "peak_MiB": peak,
             "row_sum_error": float(np.abs(factor.sum(axis=1) - 1).max()),
             "row_sum_error_as_found": float(np.abs(sums - 1).max()),
             **more,
