@@ -7,14 +7,16 @@ occluders at the points of a rule on the other.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.core.cpu import CPUTargetOptions
 
 from radiosity.form_factors._contour import CONTOUR_ROWS, contour_integral_in
 from radiosity.form_factors.analytic import _clip_pair
 from workbench.culling.tally import CLOSED, CUT, OVERFLOW, PIECES
-from workbench.geometry.lambert import _HALF_OVER_PI, _edge_term, lambert_piece
+from workbench.geometry.lambert import lambert_piece
 
 MAX_CUT = 128
 """Longest candidate list of a pair that is cut exactly."""
@@ -28,9 +30,13 @@ FAR_SHARE = 0.3
 
 _INV_PI = 1.0 / math.pi
 
-_PLAIN = {"nogil": True, "cache": True, "_nrt": False}
+_PLAIN: dict[str, Any] = {"nogil": True, "cache": True}
+if hasattr(CPUTargetOptions, "_nrt"):
+    _PLAIN["_nrt"] = False
 """Kernels that allocate nothing and so need not count references: counting those of the many arrays that they
-hand on takes longer than all their arithmetic, and threads would fight over the counts."""
+hand on takes longer than all their arithmetic (1.8 to 2 times the processor time of a matrix in all), and
+threads would fight over the counts.  numba has no documented way to leave it out; a numba without this option
+compiles the same kernels, slower ones."""
 
 
 def pair_workspace(max_corners, fragments=MAX_FRAGMENTS):
@@ -177,36 +183,6 @@ def subtract(corners, k0, k1, nx, ny, nz, d, through, x, y, z, fragments, sizes,
 
 
 @njit(**_PLAIN)
-def _fragment_share(fragments, row, count, nx, ny, nz):
-    """Lambert's formula for a fragment seen from the origin (no view of its row: counting views costs more)."""
-    total = 0.0
-    has_exit = has_entry = False
-    outx = outy = outz = inx = iny = inz = 0.0
-    px, py, pz = fragments[row, count - 1, 0], fragments[row, count - 1, 1], fragments[row, count - 1, 2]
-    dp = nx * px + ny * py + nz * pz
-    for i in range(count):
-        cx, cy, cz = fragments[row, i, 0], fragments[row, i, 1], fragments[row, i, 2]
-        dc = nx * cx + ny * cy + nz * cz
-        if dp >= 0.0:
-            if dc >= 0.0:
-                total += _edge_term(px, py, pz, cx, cy, cz, nx, ny, nz)
-            else:
-                t = dp / (dp - dc)
-                outx, outy, outz = px + t * (cx - px), py + t * (cy - py), pz + t * (cz - pz)
-                has_exit = True
-                total += _edge_term(px, py, pz, outx, outy, outz, nx, ny, nz)
-        elif dc >= 0.0:
-            t = dp / (dp - dc)
-            inx, iny, inz = px + t * (cx - px), py + t * (cy - py), pz + t * (cz - pz)
-            has_entry = True
-            total += _edge_term(inx, iny, inz, cx, cy, cz, nx, ny, nz)
-        px, py, pz, dp = cx, cy, cz, dc
-    if has_exit and has_entry:
-        total += _edge_term(outx, outy, outz, inx, iny, inz, nx, ny, nz)
-    return -total * _HALF_OVER_PI
-
-
-@njit(**_PLAIN)
 def _fragment_flux(fragments, row, count, nx, ny, nz, mx, my, mz):
     """Form factor from the origin to a small far fragment with normal m: the kernel at its parts' centroids."""
     ax, ay, az = fragments[row, 0, 0], fragments[row, 0, 1], fragments[row, 0, 2]
@@ -273,7 +249,7 @@ def seen_share(
         return -1.0
     total = 0.0
     for f in range(count):
-        total += weights[f] * max(_fragment_share(fragments, f, sizes[f], nx, ny, nz), 0.0)
+        total += weights[f] * max(lambert_piece(0.0, 0.0, 0.0, nx, ny, nz, fragments[f], 0, sizes[f]), 0.0)
     return total
 
 
@@ -613,7 +589,7 @@ def _sampled(
         if far:
             clear = _fragment_flux(fragments, 0, t1 - t0, nx, ny, nz, mx, my, mz)
         else:
-            clear = _fragment_share(fragments, 0, t1 - t0, nx, ny, nz)
+            clear = lambert_piece(0.0, 0.0, 0.0, nx, ny, nz, fragments[0], 0, t1 - t0)
         if clear <= 0.0:
             continue
         count = _cut(x, y, z, reach, kc, ks, kn, kd, through, kept, many, fragments, sizes, weights, tally)
@@ -624,7 +600,7 @@ def _sampled(
             if far:
                 share += weights[f] * _fragment_flux(fragments, f, sizes[f], nx, ny, nz, mx, my, mz)
             else:
-                share += weights[f] * max(_fragment_share(fragments, f, sizes[f], nx, ny, nz), 0.0)
+                share += weights[f] * max(lambert_piece(0.0, 0.0, 0.0, nx, ny, nz, fragments[f], 0, sizes[f]), 0.0)
         whole += w * clear
         seen += w * share
         part = share / clear
