@@ -14,6 +14,7 @@ Irradiance is interpolated, never radiance: reflectance multiplies last.
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 import pickle
@@ -67,6 +68,12 @@ TILE = 256
 TILES_IN_MEMORY = 8
 _PIXEL_BYTES = 16000
 """Memory that a pixel of a tile takes while it is drawn, edges counted."""
+CHECKED, CHECKED_OF = (128, 512), 32
+"""Pixels of a picture that are drawn again to tell its error: one of 32, within these."""
+STEPS = (0.05, 4.0)
+"""Relative steps to a neighbour, clipped to these, by which they are chosen."""
+CHECK_SHARE = 0.5
+"""Standard error of these, as a share of the picture's error."""
 DEPTH = 6
 """Reflections and refractions in a row."""
 FUZZY_DEPTH = 3
@@ -233,6 +240,15 @@ class PictureGatherer:
         for each in distinct.tolist():
             self._known.setdefault(each, len(self._known))
         return np.array([self._known[each] for each in distinct.tolist()], dtype=np.int64)[place.ravel()]
+
+    def _checking(self) -> PictureGatherer:
+        """One that draws single pixels with more care, and looks where hits read the solution at what is true there."""
+        other = copy.copy(self)
+        other.options = replace(self.options, error=CHECK_SHARE / NODE_ERROR * self.options.error, rays=None)
+        other.seed = self.seed + 104_729
+        other.gatherer = self.gatherer.doubting()
+        other._places = sobol(2 * self.options.subsamples, np.random.default_rng(other.seed))
+        return other
 
     def draw(self, rays: PinholeRays) -> Picture:
         """The whole picture at once."""
@@ -414,6 +430,60 @@ class Picture:
                 self.finished.add(number)
                 yield 0.9 + 0.1 * len(self.finished) / many
 
+    def measured_error(self) -> float:
+        """Relative error of the picture, by drawing some of its pixels again.
+
+        Each is drawn alone, with other and more rays, without interpolation, and with light that is gathered
+        once more where rays would read the solution: all that the picture is off by shows, but for
+        what the second gather reads.  What the second look is off by itself is taken off.
+
+        Returns
+        -------
+        float
+            Root mean square, over the pixels that show anything, of the norm of the bands' error relative to
+            the norm of the bands.
+        """
+        height, width, bands = self.radiance.shape
+        many = min(max(height * width // CHECKED_OF, CHECKED[0]), CHECKED[1], height * width)
+        chance = self._chances()
+        rng = np.random.default_rng(self.owner.seed + 1)
+        chosen = np.searchsorted(np.cumsum(chance), (np.arange(many) + rng.random(many)) / many)
+        chosen, times = np.unique(np.minimum(chosen, height * width - 1), return_counts=True)
+        row, column = np.divmod(chosen, width)
+        other = Picture(self.owner._checking(), self.rays)
+        parts = []
+        for left, top, right, bottom in self.tiles:
+            inside = np.flatnonzero((column >= left) & (column < right) & (row >= top) & (row < bottom))
+            if not len(inside):
+                continue
+            tile = _Tile(other, left, top, right, bottom)
+            place = (row[inside] - top) * (right - left) + column[inside] - left
+            found, variance = tile.drawn_alone(place)
+            drawn = self.radiance[top:bottom, left:right].reshape(-1, bands)[place]
+            norm = (found**2).sum(axis=1)
+            weight = np.where(norm > 0, times[inside] / chance[chosen[inside]], 0.0)
+            off = np.column_stack([((drawn - found) ** 2).sum(axis=1), variance.sum(axis=1)])
+            parts.append(np.column_stack([weight, (weight / np.maximum(norm, 1e-300))[:, None] * off]))
+            self.counters.merge(tile.counters)
+        weight, whole, own = np.concatenate(parts).sum(axis=0).tolist()
+        if weight == 0.0:
+            return 0.0
+        # Of a picture that is better than the second look the difference tells little: no less than half is stated.
+        return math.sqrt(max(whole - own, 0.25 * whole) / weight)
+
+    def _chances(self) -> FloatArray:
+        """Chances (pixels,) of being drawn again: as the steps to the neighbours, where errors are large."""
+        norm = np.linalg.norm(self.radiance, axis=2)
+        step = np.zeros_like(norm)
+        for axis in (0, 1):
+            change = np.abs(np.diff(norm, axis=axis))
+            for side in ((1, 0), (0, 1)):
+                pad = [(0, 0), (0, 0)]
+                pad[axis] = side
+                step = np.maximum(step, np.pad(change, pad))
+        share = np.clip(step / np.maximum(norm, 1e-300), *STEPS).ravel()
+        return share / share.sum()
+
     def _take(self, tile: _Tile) -> None:
         left, top, right, bottom = tile.left, tile.top, tile.left + tile.width, tile.top + tile.height
         part = (slice(top, bottom), slice(left, right))
@@ -528,6 +598,26 @@ class _Tile:
         for band in range(self.owner.bands):
             weights = fragments.gain[:, band] * arriving[:, band]
             self.radiance[:, band] += np.bincount(fragments.pixel, weights, len(self.radiance))
+
+    def drawn_alone(self, pixels: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Radiance (n, bands) of some pixels without nodes, and its variance by bundles."""
+        shape = self.height * self.width
+        radiance = np.zeros((shape, self.owner.bands))
+        fragments, direct, crowded, _ = self._divide(pixels, radiance)
+        variance = np.zeros_like(radiance)
+        arriving, bands = direct, self.owner.bands
+        self.light = _Light(radiance, fragments, direct, crowded)
+        if self.light.asks_nodes(self.options.indirect):
+            found, spread, _ = self._bundles(fragments, np.arange(len(fragments)))
+            if self.options.indirect:
+                arriving = arriving + found[:, :bands]
+            arriving = arriving + np.where(crowded[:, None], found[:, bands:], 0.0)
+            for band in range(bands):
+                square = (fragments.gain[:, band] * spread[:, band]) ** 2
+                variance[:, band] = np.bincount(fragments.pixel, square, shape)
+        for band in range(bands):
+            radiance[:, band] += np.bincount(fragments.pixel, fragments.gain[:, band] * arriving[:, band], shape)
+        return radiance[pixels], variance[pixels]
 
     # ---- rays from the eye ----------------------------------------------------------------------
 

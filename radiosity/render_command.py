@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from radiosity.stopping import INTERRUPTED, solve_progress
 from workbench.errors import InputError, OptionError
 
 if TYPE_CHECKING:
@@ -25,9 +26,12 @@ if TYPE_CHECKING:
     from workbench.record import RunRecord
     from workbench.scene.model import Camera, Scene
 
-__all__ = ["elements_for", "render"]
+__all__ = ["render", "solve_for"]
 
-INTERRUPTED = 130
+SOLVE_ERROR = 2.0
+"""Error of the solve, as a multiple of the picture's: the gather refines what it reads."""
+FEW_POLYGONS = 2000
+"""Scenes of more are tessellated, and one mesh by a rule costs a fifth of two that tell their error (measured)."""
 QUICK_ERROR = 0.1
 ROUGH_PIXELS = 120_000
 """Pixels of the rough picture that stands in until the real one is drawn."""
@@ -227,9 +231,21 @@ def _chosen_camera(
 # ---- from a solution ----------------------------------------------------------------------------
 
 
-def elements_for(error: float) -> int:
-    """Elements of the solve for a picture of an error: the gather refines what it reads, so a coarse mesh will do."""
-    return int(min(max(8.0 / error, 100), 4000))
+def solve_for(scene: Scene, error: float, **options: Any) -> Solution:
+    """A solution for a picture of an error: the gather refines what it reads, so a coarse one will do.
+
+    ``options`` are those of :func:`radiosity.solve`.
+    """
+    import radiosity
+
+    polygons = sum(surface.face_count for surface in scene.surfaces)
+    if polygons <= FEW_POLYGONS:
+        solution = radiosity.solve(scene, error=min(SOLVE_ERROR * error, 0.5), **options)
+    else:
+        elements = int(min(max(8.0 / error, 100), 4000))
+        solution = radiosity.solve(scene, elements=elements, tolerance=min(0.25 * error, 0.05), **options)
+        solution.record.choices["elements"] = f"by a rule, for {polygons} polygons are too many to compare meshes"
+    return solution
 
 
 def _render_gathered(
@@ -252,7 +268,16 @@ def _render_gathered(
 
     record = RunRecord("render")
     begin = time.perf_counter()
-    solution = _solution(scene_name, solution_path, wanted, workers, seed, record)
+    kept = path.with_name(path.name + ".resume.npz")
+    kept_solution = path.with_name(path.name + ".solution")
+    if resume and not (kept.is_file() or kept_solution.is_dir()):
+        raise InputError(f"{kept}: not found, expected what a stopped picture leaves; draw without --resume")
+    solution = _solution(scene_name, solution_path, wanted, workers, seed, record, kept_solution if resume else None)
+    again = "give --resume to go on"
+    if solution.stopped == "interrupted" and solution_path is None:
+        _write_solution(kept_solution, solution)
+        click.echo(f"radiosity: stopped during the solve; {kept_solution} holds it, {again}", err=True)
+        raise SystemExit(INTERRUPTED)
     if solution.scene.bands not in (1, 3):
         raise InputError(f"{solution.scene.name}: found {solution.scene.bands} bands, expected 1 or 3 for a picture")
     found = solution_camera(solution)
@@ -266,9 +291,8 @@ def _render_gathered(
                    "fov_deg": float(camera.fov_deg), "width": camera.width, "height": camera.height},
     }  # fmt: skip
     canvas = _Canvas(path, tone, exposure, white)
-    kept = path.with_name(path.name + ".resume.npz")
     identity = json.dumps(record.settings | {"elements": solution.mesh.element_count}, sort_keys=True)
-    state = _read_state(kept, identity) if resume else None
+    state = _read_state(kept, identity) if resume and kept.is_file() else None
     picture: Picture | None = None
     try:
         if state is None and camera.width * camera.height * (QUICK_ERROR / wanted) > ROUGH_PIXELS:
@@ -284,19 +308,24 @@ def _render_gathered(
         with record.stage("gather"):
             _draw(picture, canvas)
     except KeyboardInterrupt:
+        if solution_path is None:
+            _write_solution(kept_solution, solution)
         if picture is None or not (picture.drafted or canvas.under is not None):
-            raise
+            if solution_path is None:
+                click.echo(f"radiosity: stopped before the picture; {kept_solution} holds the solve, {again}", err=True)
+            raise SystemExit(INTERRUPTED) from None
         canvas.write(picture)
         _write_state(kept, identity, picture, canvas.under)
         done = len(picture.finished | picture.drafted)
         click.echo(
-            f"radiosity: stopped after {done} of {len(picture.tiles)} tiles; {path} holds what is drawn, "
-            "give --resume to go on",
+            f"radiosity: stopped after {done} of {len(picture.tiles)} tiles; {path} holds what is drawn, {again}",
             err=True,
         )
         raise SystemExit(INTERRUPTED) from None
     canvas.write(picture)
-    kept.unlink(missing_ok=True)
+    _forget(kept, kept_solution)
+    with record.stage("error estimate"):
+        record.errors["picture_relative_rms"] = picture.measured_error()
     record.counters.merge(picture.counters)
     files = [path]
     if show_samples:
@@ -312,7 +341,8 @@ def _render_gathered(
     if json_path is not None:
         record.write(json_path)
     lines = [
-        f"{solution.scene.name}: {camera.width} x {camera.height}, error {wanted:g}; "
+        f"{solution.scene.name}: {camera.width} x {camera.height}, error of a pixel "
+        f"{record.errors['picture_relative_rms']:.2g} where {wanted:g} was asked; "
         + ", ".join(f"{count.sum() / pixels:.3g} {name}" for name, count in picture.samples.items())
         + " samples a pixel",
         f"{record.counters['rays']:,} rays; read from {gatherer.gatherer.solution.mesh.element_count} elements",
@@ -323,9 +353,13 @@ def _render_gathered(
 
 
 def _solution(
-    scene_name: str | None, solution_path: Path | None, error: float, workers: int | None, seed: int, record: RunRecord
-) -> Solution:
-    """The solution to draw from: a saved one, or a new one that is as good as the picture needs."""
+    scene_name: str | None, solution_path: Path | None, error: float, workers: int | None, seed: int,
+    record: RunRecord, kept: Path | None,
+) -> Solution:  # fmt: skip
+    """The solution to draw from: a saved one, or a new one that is as good as the picture needs.
+
+    ``kept`` is the folder in which a stopped run left its solution, if this one resumes it.
+    """
     if solution_path is not None:
         from radiosity.solvers.solution import Solution
 
@@ -336,23 +370,31 @@ def _solution(
 
                 solution = replace(solution, scene=workbench.load(scene_name))
         return solution
-    import radiosity
     import workbench
 
     with record.stage("read"):
         scene = workbench.load(scene_name or "")
     for note in scene.notes:
         click.echo(f"note: {note}", err=True)
-    with record.stage("solve"), _bar() as bar:
-        bar.set_description_str("solve")
-        solution = radiosity.solve(
-            scene,
-            elements=elements_for(error),
-            tolerance=min(0.25 * error, 0.05),
-            seed=seed,
-            workers=workers or len(os.sched_getaffinity(0)),
+    previous = None
+    if kept is not None and kept.is_dir():
+        from radiosity.solvers.solution import Solution
+
+        previous = Solution.load(kept)
+        previous.scene = scene
+        if previous.record.settings.get("picture_error") != error:
+            raise InputError(f"{kept}: found another picture's; give the same options, or draw without --resume")
+    if previous is not None and previous.stopped != "interrupted":
+        return previous
+    with record.stage("solve"), solve_progress() as report:
+        solution = solve_for(
+            scene, error, seed=seed, workers=workers or len(os.sched_getaffinity(0)), progress=report, resume=previous
         )
+    solution.record.settings["picture_error"] = error
     record.counters.merge(solution.record.counters)
+    record.choices |= {f"solve: {name}": text for name, text in solution.record.choices.items()}
+    if "estimate" in solution.record.errors:
+        record.errors["solution"] = solution.record.errors["estimate"]
     return solution
 
 
@@ -451,8 +493,6 @@ def _read_state(kept: Path, identity: str) -> dict[str, NDArray] | None:
     """What a stopped run left, if it was this picture's."""
     import numpy as np
 
-    if not kept.is_file():
-        raise InputError(f"{kept}: not found, expected what a stopped picture leaves; draw without --resume")
     try:
         with np.load(kept, allow_pickle=False) as stored:
             state = {name: stored[name] for name in stored.files}
@@ -462,6 +502,22 @@ def _read_state(kept: Path, identity: str) -> dict[str, NDArray] | None:
     if known != identity:
         raise InputError(f"{kept}: found another picture's; give the same scene and options, or draw without --resume")
     return state
+
+
+def _forget(kept: Path, folder: Path) -> None:
+    """Remove what a stopped run left."""
+    kept.unlink(missing_ok=True)
+    (folder / "solution.npz").unlink(missing_ok=True)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def _write_solution(folder: Path, solution: Solution) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+        solution.save_state(folder)
+    except OSError as problem:
+        raise InputError(f"{folder}: cannot be written: {problem.strerror or problem}") from None
 
 
 def _write_state(kept: Path, identity: str, picture: Picture, under: NDArray | None) -> None:

@@ -192,6 +192,12 @@ class Gatherer:
         other._read(solution)
         return other
 
+    def doubting(self) -> Gatherer:
+        """This gatherer, but gathering light again at hits of any distance, to see what the solution is off by."""
+        other = copy.copy(self)
+        other._coarse = np.where(self._coarse > 0, math.inf, 0.0)
+        return other
+
     def _read(self, solution: Solution) -> None:
         scene, mesh = solution.scene, solution.mesh
         self.solution = solution

@@ -287,6 +287,56 @@ def test_ctrl_c_leaves_what_is_drawn_and_resume_goes_on(corner, tmp_path, monkey
     np.testing.assert_allclose(a, b, rtol=0.1)
 
 
+def test_ctrl_c_in_the_solve_leaves_it_and_resume_goes_on(corner, tmp_path, monkeypatch):
+    import signal
+
+    import radiosity
+
+    solve, events = radiosity.solve, []
+
+    def interrupting(scene, *, progress, **options):
+        def report(event):
+            events.append(event)
+            if len(events) == 2:
+                signal.raise_signal(signal.SIGINT)
+            progress(event)
+
+        return solve(scene, progress=report, **options)
+
+    before = signal.getsignal(signal.SIGINT)
+    out, kept = tmp_path / "a.exr", tmp_path / "a.exr.solution"
+    monkeypatch.setattr(radiosity, "solve", interrupting)
+    result = render(corner, "-o", out, "--quick")
+    assert result.exit_code == 130 and "--resume" in result.stderr and not out.exists()
+    assert signal.getsignal(signal.SIGINT) is before
+    assert (radiosity.Solution.load(kept).radiosity >= 0).all()
+    monkeypatch.setattr(radiosity, "solve", solve)
+    other = render(corner, "-o", out, "--error", 0.2, "--resume")
+    assert other.exit_code == 2 and "another picture" in other.stderr
+    result = render(corner, "-o", out, "--quick", "--resume")
+    assert result.exit_code == 0, result.output
+    assert out.exists() and not kept.exists()
+
+
+def test_the_picture_states_its_error(corner, tmp_path):
+    # Against the same picture at a far smaller error.
+    import OpenEXR
+
+    found = {}
+    for error in (0.2, 0.05, 0.01):
+        out, record = tmp_path / f"{error}.exr", tmp_path / "r.json"
+        result = render(corner, "-o", out, "--error", error, "--size", "32x24", "--json", record)
+        assert result.exit_code == 0, result.output
+        found[error] = (
+            OpenEXR.File(str(out)).channels()["RGB"].pixels.astype(float),
+            json.loads(record.read_text())["errors"]["picture_relative_rms"],
+        )
+    truth, _ = found.pop(0.01)
+    for error, (picture, stated) in found.items():
+        actual = np.sqrt(np.mean(((picture - truth) ** 2).sum(axis=2) / (truth**2).sum(axis=2)))
+        assert actual / 3 < stated < 3 * max(actual, 0.3 * error)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

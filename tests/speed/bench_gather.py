@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 import radiosity
 import workbench
 from radiosity.gather import GatherOptions, PictureGatherer
-from radiosity.render_command import elements_for
+from radiosity.render_command import solve_for
 from workbench.render.camera import PinholeRays
 
 FloatArray = NDArray[np.float64]
@@ -101,7 +101,7 @@ def reference(path: Path, mitsuba: Any, camera: Any, seconds: float) -> tuple[Fl
 def ours(scene: Any, camera: Any, error: float, **options: Any) -> tuple[Any, Clock]:
     """A picture from nothing: solve, regather, gather."""
     with Clock() as clock:
-        solution = radiosity.solve(scene, elements=elements_for(error), tolerance=min(0.25 * error, 0.05))
+        solution = solve_for(scene, error)
         gatherer = PictureGatherer(solution, GatherOptions(error=error, **options))
         picture = gatherer.draw(PinholeRays.from_camera(camera))
     return picture, clock
@@ -145,7 +145,7 @@ def atomic_savings(name: str, size: int, error: float = 0.02) -> None:
     scene = workbench.load(name)
     camera = replace(scene.camera, width=size, height=size)
     rays = PinholeRays.from_camera(camera)
-    solution = radiosity.solve(scene, elements=elements_for(error), tolerance=0.25 * error)
+    solution = solve_for(scene, error)
     # The judge: every fragment gathered with many rays, from the same solution, in two halves.
     gatherer = PictureGatherer(solution, GatherOptions(error=error))
 
