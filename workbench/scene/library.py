@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from workbench.arrays import as_bands
 from workbench.errors import InputError
 from workbench.geometry.polygons import check_polygon, convex_pieces, plane_basis, vector_area
-from workbench.geometry.tessellation import sphere_mesh
+from workbench.geometry.tessellation import cone_mesh, sphere_mesh
 from workbench.scene.model import Material, Scene, Sphere, Surface
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "BOX_SIDES",
     "box_surface",
     "closed_scene_gaps",
+    "cone_surface",
     "diffuse",
     "polygon_fault",
     "quad_light_over_floor",
@@ -105,6 +106,43 @@ def sphere_surface(
         faces[:, ::-1] if inward else faces,
         vertex_normals=-normals if inward else normals,
         sphere=Sphere(np.asarray(center, dtype=np.float64), float(radius)),
+        facet_error=distance,
+    )
+
+
+def cone_surface(
+    name: str,
+    material: Material,
+    base: ArrayLike,
+    base_radius: float,
+    apex: ArrayLike,
+    apex_radius: float,
+    *,
+    facet_error: float = 0.02,
+    inward: bool = False,
+) -> Surface:
+    """The side of a cone, a cut cone or a cylinder as facets, see :func:`~workbench.geometry.tessellation.cone_mesh`.
+
+    Parameters
+    ----------
+    name, material
+        Of the surface.
+    base, apex : (3,) float
+        Centres of the end circles.
+    base_radius, apex_radius : float
+        [scene lengths]
+    facet_error : float
+        Largest distance between surface and facets, as a share of the larger radius.
+    inward : bool
+        Whether the front is the inside.
+    """
+    vertices, faces, normals, distance = cone_mesh(base, base_radius, apex, apex_radius, facet_error)
+    return Surface.from_mesh(
+        name,
+        material,
+        vertices,
+        faces[:, ::-1] if inward else faces,
+        vertex_normals=-normals if inward else normals,
         facet_error=distance,
     )
 

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.errors import SceneError
-from workbench.geometry.tessellation import cone_mesh
 from workbench.scene._tokens import LARGEST_SIDE, Words, read_text, ring_fault
-from workbench.scene.library import sphere_surface
+from workbench.scene.library import cone_surface, sphere_surface
 from workbench.scene.model import Camera, Light, Material, Scene, Surface
 
 __all__ = [
@@ -271,17 +270,15 @@ def _round_surface(name: str, material: Material, thing: NffSphere | NffCone, fa
         return sphere_surface(
             name, material, thing.center, abs(thing.radius), facet_error=facet_error, inward=thing.radius < 0
         )
-    inside = min(thing.base_radius, thing.apex_radius) < 0
-    vertices, faces, normals, distance = cone_mesh(
-        thing.base, abs(thing.base_radius), thing.apex, abs(thing.apex_radius), facet_error
-    )
-    return Surface.from_mesh(
+    return cone_surface(
         name,
         material,
-        vertices,
-        faces[:, ::-1] if inside else faces,
-        vertex_normals=-normals if inside else normals,
-        facet_error=distance,
+        thing.base,
+        abs(thing.base_radius),
+        thing.apex,
+        abs(thing.apex_radius),
+        facet_error=facet_error,
+        inward=min(thing.base_radius, thing.apex_radius) < 0,
     )
 
 

@@ -39,9 +39,8 @@ from numpy.typing import NDArray
 
 from workbench.errors import SceneError
 from workbench.geometry.polygons import PLANARITY, plane_basis, triangulate_ring, vector_area
-from workbench.geometry.tessellation import cone_mesh
 from workbench.scene._tokens import LARGEST, Words, read_text, ring_fault
-from workbench.scene.library import BOX_QUADS, polygon_fault, sphere_surface, transformed
+from workbench.scene.library import BOX_QUADS, cone_surface, polygon_fault, sphere_surface, transformed
 from workbench.scene.model import Camera, Light, Material, Scene, Sky, Surface
 
 __all__ = ["load_scene", "read_rad"]
@@ -520,17 +519,15 @@ def _round(primitive: _Primitive, material: Material) -> Surface:
     radii = numbers[6:8] if kind in ("cone", "cup") else np.repeat(numbers[6], 2)
     if (radii < 0).any() or not (radii > 0).any() or (numbers[:3] == numbers[3:6]).all():
         primitive.fail("expected radii of 0 or more, not all 0, and two different ends")
-    vertices, faces, normals, distance = cone_mesh(
-        numbers[:3], float(radii[0]), numbers[3:6], float(radii[1]), FACET_ERROR
-    )
-    inward = kind in ("tube", "cup")
-    return Surface.from_mesh(
+    return cone_surface(
         name,
         material,
-        vertices,
-        faces[:, ::-1] if inward else faces,
-        vertex_normals=-normals if inward else normals,
-        facet_error=distance,
+        numbers[:3],
+        float(radii[0]),
+        numbers[3:6],
+        float(radii[1]),
+        facet_error=FACET_ERROR,
+        inward=kind in ("tube", "cup"),
     )
 
 
