@@ -37,6 +37,8 @@ def explain(scene: str, error: float, repeats: int, seed: int, workers: int | No
     from workbench.record import check_folder
 
     check_folder(directory)
+    import numpy as np
+
     import workbench
     from radiosity.report import cost_model, explanation
     from workbench.study.result import StudyResult, format_table, write_study
@@ -55,9 +57,9 @@ def explain(scene: str, error: float, repeats: int, seed: int, workers: int | No
     found.facts.append(f"where the seconds go, by the committed table of costs: {shares}")
     rows = [
         {
-            "part": item.part, "decision": item.decision, "without it": item.without, "seconds": item.seconds,
-            "without": item.seconds_without, "times": item.ratio, "error_%": 100 * item.error,
-            "without_%": 100 * item.error_without,
+            "part": item.part, "decision": item.decision, "without it": item.without,
+            "seconds": float(np.median(item.seconds)), "times": item.ratio, "from": min(item.ratios),
+            "to": max(item.ratios), "error_%": 100 * item.error, "without_%": 100 * item.error_without,
         }
         for item in found.ablations
     ]  # fmt: skip

@@ -1,12 +1,14 @@
 """Why a solve does what it does: what the solver uses and leaves out, and what each decision saves.
 
-Every saving is measured: the same question is asked again with one decision switched off.  The
-answers are compared with a better one, so that what a decision costs in accuracy stands beside it.
+Every saving is measured: the same question is asked again with one decision switched off, in interleaved
+rounds.  The answers are compared with a better one, so that what a decision costs in accuracy stands
+beside it.  A decision without which the same work is done, count by count, saves nothing here; it is
+told as such and not timed against itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -20,6 +22,7 @@ from radiosity.report.metrics import relative_rms
 from radiosity.sensors import Gatherer
 from radiosity.solvers.solution import Solution
 from radiosity.solvers.solve import _settings
+from workbench.counters import Counters
 from workbench.geometry.flat import Geometry
 from workbench.scene.model import Scene
 from workbench.shadow.lights import lights_of_scene
@@ -39,7 +42,7 @@ POINTS = 512
 """Points at which shadows are found again."""
 MOST_SAMPLES = 4096
 """Rays a point at which the search for as many as the error needs ends."""
-MOST_DOUBLINGS = 3
+MOST_DOUBLINGS = 2
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,10 @@ class Ablation:
         ``mesh``, ``form factors`` or ``shadows``.
     decision, without : str
         What is done, and what is done in its place.
-    seconds, seconds_without : float
-        Medians of interleaved runs.
+    used, used_without : str
+        What each of the two runs did, by its own record: never the same.
+    seconds, seconds_without : tuple of float
+        Of interleaved rounds, in their order.
     error, error_without : float
         Relative, against a better answer.
     """
@@ -61,15 +66,55 @@ class Ablation:
     part: str
     decision: str
     without: str
-    seconds: float
-    seconds_without: float
+    used: str
+    used_without: str
+    seconds: tuple[float, ...]
+    seconds_without: tuple[float, ...]
     error: float
     error_without: float
 
     @property
+    def ratios(self) -> tuple[float, ...]:
+        """How many times as long the work took without the decision, round by round."""
+        return tuple(b / a for a, b in zip(self.seconds, self.seconds_without, strict=True))
+
+    @property
     def ratio(self) -> float:
-        """How many times as long the work takes without the decision."""
-        return self.seconds_without / self.seconds
+        """Their median."""
+        return float(np.median(self.ratios))
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """What a run answers, and what it did."""
+
+    values: FloatArray
+    used: str
+
+
+def _did(counters: Mapping[str, int]) -> str:
+    """The counts of a run that tell it from another."""
+    names = ("rays", "exact_cuts", "closed_forms", "shaft_tests", "plane_vertex_checks", "links")
+    return ", ".join(f"{counters.get(name, 0):,} {name.replace('_', ' ')}" for name in names if counters.get(name, 0))
+
+
+def _ablate(
+    found: Explanation, part: str, words: Mapping[str, tuple[str, str]], base: str,
+    tasks: Mapping[str, Callable[[], _Outcome]], repeats: int, error: Callable[[FloatArray], float],
+) -> None:  # fmt: skip
+    """Run ``base`` and the task of each decision in interleaved rounds, and note what differs."""
+    asked = {name: tasks[name] for name in (base, *words)}
+    seconds, answers = interleaved(asked, repeats)
+    for name, (decision, without) in words.items():
+        if answers[name].used == answers[base].used:
+            found.facts.append(f"{part}: {decision!r} changes nothing here: {without!r} is the same work")
+            continue
+        found.ablations.append(
+            Ablation(
+                part, decision, without, answers[base].used, answers[name].used, tuple(seconds[base]),
+                tuple(seconds[name]), error(answers[base].values), error(answers[name].values),
+            )
+        )  # fmt: skip
 
 
 @dataclass
@@ -116,7 +161,7 @@ def explain(
     points = surface_points(solution.mesh, POINTS, seed=3)
     _shadows(found, geometry, points, error, seed, repeats, workers)
     report("solving other meshes ...")
-    _meshes(found, points, error, seed, workers)
+    _meshes(found, points, error, seed, workers, repeats)
     return found
 
 
@@ -144,6 +189,10 @@ def _mesh_facts(found: Explanation, geometry: Geometry, error: float) -> None:
         f"most elements on {', '.join(f'{geometry.surface_name[i]!r} ({elements[i]})' for i in finest)}",
         f"surfaces not subdivided: {_listed(whole)}",
     ]
+    spent = record.seconds
+    whole_run = sum(spent.values())
+    if whole_run > 0 and "error estimate" in spent:
+        found.facts.append(f"the error estimate itself took {spent['error estimate'] / whole_run:.0%} of the seconds")
     if fewer:
         found.facts.append(f"surfaces with fewer elements than facets (clustered): {_listed(fewer)}")
     counts = record.counters
@@ -178,10 +227,10 @@ def _links(found: Explanation, geometry: Geometry, seed: int, repeats: int) -> N
     used = _settings(asked, rays, seed, mesh.patch_count)
     workers = int(record.settings["workers"])
 
-    def columns(settings: LinkSettings) -> FloatArray:
+    def columns(settings: LinkSettings) -> _Outcome:
         bundles = ReceiverBundles(geometry, mesh, settings, workers)
         try:
-            return bundles.columns(chosen).factor
+            return _Outcome(bundles.columns(chosen).factor, _did(bundles.counters))
         finally:
             bundles.close()
 
@@ -193,13 +242,12 @@ def _links(found: Explanation, geometry: Geometry, seed: int, repeats: int) -> N
         "floor": replace(used, floor=1e-9),
         "error": _settings(min(asked / 10, 1e-3), rays, seed, mesh.patch_count),
     }
-    better = columns(replace(_settings(min(asked / 30, 3e-4), rays * 16, seed + 1, mesh.patch_count)))
+    better = columns(replace(_settings(min(asked / 30, 3e-4), rays * 16, seed + 1, mesh.patch_count))).values
     columns(used)
-    seconds, answers = interleaved({name: partial(columns, s) for name, s in variants.items()}, repeats)
     where = better > 0
 
-    def error(name: str) -> float:
-        return relative_rms(answers[name][where][:, None], better[where][:, None])[0]
+    def error(values: FloatArray) -> float:
+        return relative_rms(values[where][:, None], better[where][:, None])[0]
 
     words = {
         "cut": ("short lists of candidates are cut exactly", "rays for all"),
@@ -210,10 +258,8 @@ def _links(found: Explanation, geometry: Geometry, seed: int, repeats: int) -> N
         "floor": ("faint form factors get less care", "all get the same"),
         "error": (f"form factors to {asked:g}, as the error needs", f"form factors to {min(asked / 10, 1e-3):g}"),
     }
-    base = float(np.median(seconds["used"]))
-    for name, (decision, without) in words.items():
-        took = float(np.median(seconds[name]))
-        found.ablations.append(Ablation("form factors", decision, without, base, took, error("used"), error(name)))
+    tasks = {name: partial(columns, settings) for name, settings in variants.items()}
+    _ablate(found, "form factors", words, "used", tasks, repeats, error)
 
 
 # ---- shadows ----------------------------------------------------------------------------------------
@@ -248,16 +294,22 @@ def _shadows(
     automatic = ask("auto")
     goal = max(error, off(automatic))
     _light_facts(found, lights, automatic)
-    tasks: dict[str, Callable[[], Any]] = {"auto": partial(ask, "auto"), "exact": partial(ask, "exact")}
+
+    def outcome(method: str, samples: int) -> _Outcome:
+        estimate = ask(method, samples)
+        return _Outcome(estimate.irradiance, _did(estimate.counters))
+
+    tasks: dict[str, Callable[[], _Outcome]] = {
+        "auto": partial(outcome, "auto", 64),
+        "exact": partial(outcome, "exact", 64),
+    }
     needed: dict[str, int] = {}
     for method in ("rays", "shaft"):
         samples = 4
         while samples < MOST_SAMPLES and off(ask(method, samples)) > goal:
             samples *= 2
         needed[method] = samples
-        tasks[method] = partial(ask, method, samples)
-    seconds, answers = interleaved(tasks, repeats)
-    base, reached = float(np.median(seconds["auto"])), off(answers["auto"])
+        tasks[method] = partial(outcome, method, samples)
     words = {
         "rays": ("cullers settle what is clear or dark", f"{needed['rays']} rays at every point"),
         "shaft": (
@@ -266,9 +318,7 @@ def _shadows(
         ),
         "exact": ("rays where candidates are many", "exact cuts everywhere"),
     }
-    for name, (decision, without) in words.items():
-        took = float(np.median(seconds[name]))
-        found.ablations.append(Ablation("shadows", decision, without, base, took, reached, off(answers[name])))
+    _ablate(found, "shadows", words, "auto", tasks, repeats, lambda values: relative_rms(values, exact)[0])
 
 
 def _light_facts(found: Explanation, lights: Sequence[Any], estimate: Any) -> None:
@@ -293,84 +343,71 @@ def _light_facts(found: Explanation, lights: Sequence[Any], estimate: Any) -> No
 
 
 def _meshes(
-    found: Explanation, where: tuple[Any, Any, Any], error: float, seed: int, workers: int | None
+    found: Explanation, where: tuple[Any, Any, Any], error: float, seed: int, workers: int | None, repeats: int
 ) -> None:  # fmt: skip
-    """The same light read off the mesh without a gather, and from a mesh twice as fine."""
-    from time import perf_counter
-
+    """A solve of that many elements and a gather from it, whole, with decisions switched off."""
     from radiosity.element_lookup import ElementLookup
 
     points, normals, polygons = where
     final = found.solution
-    count = final.mesh.element_count
-    settings = {
-        name: final.record.settings[name] for name in ("method", "rays", "tolerance", "form_factor_error", "seed")
-    } | {"workers": workers}
+    count, method = final.mesh.element_count, str(final.record.settings["method"])
+    asked = float(final.record.settings["form_factor_error"] or 0.02)
+    settings = {name: final.record.settings[name] for name in ("method", "rays", "tolerance", "seed")} | {
+        "workers": workers, "form_factor_error": asked,
+    }  # fmt: skip
     flat = polygons >= 0
 
-    def solved(elements: int = count, **other: Any) -> tuple[Solution, float]:
-        start = perf_counter()
-        solution = solve(final.scene, elements=elements, **(settings | other))
-        return solution, perf_counter() - start
+    def solved(elements: int, other: dict[str, Any]) -> Solution:
+        return solve(final.scene, elements=elements, **(settings | other))
 
-    def gathered(solution: Solution) -> tuple[FloatArray, float]:
-        start = perf_counter()
-        found = Gatherer(solution, workers=workers, seed=seed).irradiance(
+    def said(solution: Solution, counters: Mapping[str, int], how: str) -> str:
+        used, n = solution.record.settings, solution.mesh.element_count
+        exactness = f"form factors to {used['form_factor_error']:g}"
+        return f"{used['method']}, {n:,} elements, {exactness}, {how}; {_did(counters)}"
+
+    def gathered(elements: int = count, **other: Any) -> _Outcome:
+        solution = solved(elements, other)
+        sensed = Gatherer(solution, workers=workers, seed=seed).irradiance(
             points, normals, own_polygon=polygons, error=0.3 * error
         )
-        return found.irradiance, perf_counter() - start
+        counters = Counters()
+        counters.merge(solution.record.counters)
+        counters.merge(sensed.counters)
+        return _Outcome(sensed.irradiance[flat], said(solution, counters, "gathered"))
 
-    once, took = solved(count)
-    finer, longer = solved(2 * count)
-    better, more = gathered(finer)
-    values, gathering = gathered(once)
-    base = took + gathering
-    reached = relative_rms(values[flat], better[flat])[0]
-    found.ablations.append(
-        Ablation("mesh", f"{count:,} elements are enough", f"{2 * count:,} elements", base, longer + more, reached, 0.0)
-    )
-
-    if settings["method"] == "matrix":
-        _matrix(found, solved, gathered, better[flat], flat, base, reached)
-
-    def read(solution: Solution) -> float:
+    def read(elements: int) -> _Outcome:
+        solution = solved(elements, {})
         lookup = ElementLookup.build(Geometry.from_scene(solution.scene), solution.mesh)
         element = lookup.elements(points[flat], polygons[flat], np.ones(int(flat.sum()), dtype=bool))
-        return relative_rms(solution.element_irradiance[element], better[flat])[0]
+        return _Outcome(solution.element_irradiance[element], said(solution, solution.record.counters, "read off"))
 
-    goal = max(error, reached)
-    elements, off, spent = count, read(once), took
-    for doubling in range(MOST_DOUBLINGS):
-        if off <= goal:
+    better = gathered(4 * count, form_factor_error=asked / 10).values
+
+    def off(values: FloatArray) -> float:
+        return relative_rms(values, better)[0]
+
+    goal = max(error, off(gathered().values))
+    elements = count
+    for _ in range(MOST_DOUBLINGS):
+        if off(read(elements).values) <= goal:
             break
-        elements = count * 2 ** (doubling + 1)
-        mesh, spent = (finer, longer) if doubling == 0 else solved(elements)
-        off = read(mesh)
-    found.ablations.append(
-        Ablation(
-            "mesh", "direct light is found at the point", f"read off {elements:,} elements", base, spent, reached, off
-        )
-    )
-
-
-def _matrix(
-    found: Explanation, solved: Callable[..., tuple[Solution, float]],
-    gathered: Callable[..., tuple[FloatArray, float]],
-    better: FloatArray, flat: NDArray[np.bool_], base: float, reached: float,
-) -> None:  # fmt: skip
-    """What the full matrix saves, and what better form factors would cost."""
-    asked = float(found.solution.record.settings["form_factor_error"])
-    others: list[tuple[str, str, dict[str, Any]]] = [
-        ("all form factors at once, pairs settled in groups", "column by column, from each receiver",
-         {"method": "progressive", "form_factor_error": None}),
-        (f"form factors to {asked:g}, as the error needs", f"form factors to {asked / 10:g}",
-         {"form_factor_error": asked / 10}),
-    ]  # fmt: skip
-    for decision, without, options in others:
-        solution, took = solved(**options)
-        values, more = gathered(solution)
-        off = relative_rms(values[flat], better)[0]
-        found.ablations.append(Ablation("form factors", decision, without, base, took + more, reached, off))
+        elements *= 2
+    tasks: dict[str, Callable[[], _Outcome]] = {
+        "used": gathered, "finer": partial(gathered, 2 * count), "read": partial(read, elements),
+    }  # fmt: skip
+    words = {
+        "finer": (f"about {count:,} elements are enough", f"about {2 * count:,} elements"),
+        "read": ("direct light is found at the point", f"read off about {elements:,} elements"),
+    }
+    _ablate(found, "mesh", words, "used", tasks, repeats, off)
+    if method == "matrix":
+        tasks["columns"] = partial(gathered, method="progressive", form_factor_error=min(2.0 * error, 0.02))
+        tasks["better"] = partial(gathered, form_factor_error=asked / 10)
+        words = {
+            "columns": ("all form factors at once, pairs settled in groups", "column by column, from each receiver"),
+            "better": (f"form factors to {asked:g}, as the error needs", f"form factors to {asked / 10:g}"),
+        }
+        _ablate(found, "form factors", words, "used", tasks, repeats, off)
 
 
 # ---- the figure -------------------------------------------------------------------------------------
@@ -387,15 +424,21 @@ def draw_ablations(figure: Figure, ablations: Sequence[Ablation], title: str) ->
     axes.barh(place, [r - 1.0 for r in ratios], left=1.0, color=[colours[item.part] for item in ordered], height=0.6)
     axes.axvline(1.0, color="0.3", lw=0.8)
     axes.set_xscale("log")
-    low, high = min(0.5, *ratios), max(2.0, *ratios)
-    axes.set_xlim(low / 1.6, high * 12.0)
+    spread = [r for item in ordered for r in item.ratios]
+    low, high = min(0.5, *spread), max(2.0, *spread)
+    axes.set_xlim(low / 1.6, high * 20.0)
     for row, item in enumerate(ordered):
-        text = f"x {item.ratio:.2g};  error {item.error:.2%} -> {item.error_without:.2%}"
-        axes.text(max(item.ratio, 1.0) * 1.06, row, text, va="center", fontsize=8)
+        least, most = min(item.ratios), max(item.ratios)
+        axes.plot([least, most], [row, row], color="0.2", lw=1.2, marker="|", ms=6)
+        change = f"error {item.error:.2%} -> {item.error_without:.2%}"
+        text = f"x {item.ratio:.2g} ({least:.2g} to {most:.2g});  {change}"
+        axes.text(max(most, 1.0) * 1.08, row, text, va="center", fontsize=8)
     axes.set_yticks(place, [f"{item.decision}\nwithout: {item.without}" for item in ordered], fontsize=8)
     axes.invert_yaxis()
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_xlabel("times as long without the decision (below 1: it does not pay in seconds here)")
+    axes.set_xlabel(
+        "times as long without the decision: median and range of rounds (below 1: it does not pay in seconds here)"
+    )
     axes.set_title(title, fontsize=11)
     axes.grid(axis="x", alpha=0.25)
     handles = [figure_patch(colour, part) for part, colour in colours.items()]

@@ -55,13 +55,28 @@ def test_the_committed_table_can_be_read_and_written(tmp_path):
     ("method", "dear"), [("auto", "column by column, from each receiver"), ("progressive", "rays for all")]
 )
 def test_a_solve_is_explained(method, dear):
-    found = explain(load("l-room"), error=0.2, method=method, repeats=1)
+    found = explain(load("l-room"), error=0.2, method=method, repeats=2)
     told = "\n".join(found.facts)
     for said in ("reached", "not subdivided", "lights", "exact cuts", "rays a point"):
         assert said in told
     assert {item.part for item in found.ablations} == {"mesh", "form factors", "shadows"}
+    by_name = {item.without: item for item in found.ablations}
     for item in found.ablations:
-        assert item.seconds > 0 and item.seconds_without > 0 and np.isfinite(item.error_without)
+        assert len(item.ratios) == 2 and min(item.seconds) > 0 and np.isfinite(item.error_without)
+        # The run without the decision did other work: by its solver, its mesh or its counts.
+        assert item.used != item.used_without, item
+    for without, item in by_name.items():
+        if without.startswith("about"):
+            few, many = (int(u.split(", ")[1].split()[0].replace(",", "")) for u in (item.used, item.used_without))
+            assert many > few
+        if without.startswith("read off"):
+            assert ", gathered;" in item.used and ", read off;" in item.used_without
+        if without == "column by column, from each receiver":
+            assert item.used.startswith("matrix, ") and item.used_without.startswith("progressive, ")
+        if without == "rays for all":
+            assert "exact cuts" in item.used and "exact cuts" not in item.used_without
+        if without.endswith("rays at every point"):
+            assert "shaft tests" in item.used and "shaft tests" not in item.used_without
     errors = {item.without: item.error_without for item in found.ablations if item.part == "form factors"}
     better = next(item for item in found.ablations if item.without.startswith("form factors to"))
     # Of a whole solve, most of whose error is the mesh's: better form factors leave it as it is, or lower.
