@@ -45,7 +45,11 @@ class BoxTree:
     @classmethod
     def build(cls, geometry: Geometry) -> BoxTree:
         """Build the tree over all convex pieces of a geometry."""
-        bounds = geometry.piece_bounds
+        return cls.over(geometry.piece_bounds)
+
+    @classmethod
+    def over(cls, bounds: NDArray[np.float64]) -> BoxTree:
+        """Build the tree over boxes (p, 2, 3), each its low and its high corner."""
         count = len(bounds)
         order = np.arange(count)
         low, high = np.empty((2 * count, 3)), np.empty((2 * count, 3))
