@@ -63,6 +63,23 @@ def test_cameras_and_adaptive_samples_are_not_over_confident(method, samples):
     assert np.sqrt((z**2).mean()) < 1.2
 
 
+def test_cameras_state_about_the_error_that_they_make():
+    for light in (SQUARE, L_LIGHT):
+        z = z_scores("camera-optimised", light, 1024, 8)
+        assert 0.3 < np.sqrt((z**2).mean()) < 1.2
+        assert (np.abs(z) > 3).mean() < 0.02
+    # A straight edge along the rows of pixels, as in most rooms: off by the same part of a pixel all along.
+    edges = np.linspace(-0.9, 0.9, 40)
+    gaps = []
+    for edge in edges:
+        shade = np.array([[-5, -5, 1], [edge, -5, 1], [edge, 5, 1], [-5, 5, 1.0]])
+        shader, point = Shader(geometry_of([shade]), 1), [[0.0, 0.0, 0.0]]
+        found = shader.estimate(point, UP, SQUARE, "camera", samples=64)
+        exact = shader.estimate(point, UP, SQUARE, "exact")
+        gaps.append((found.irradiance - exact.irradiance)[0, 0] / max(found.standard_error[0, 0], 1e-15))
+    assert 0.3 < np.sqrt(np.mean(np.square(gaps))) < 1.5
+
+
 @pytest.mark.parametrize("method", ["rays", "rays+plane-vertex", "adaptive"])
 def test_linear_lights_are_not_over_confident(method):
     light = LinearLight("tube", np.ones(1), [-0.6, 0.1, 2.0], [0.6, -0.2, 2.0])

@@ -80,6 +80,9 @@ class CameraShadows:
     light_weight, visible_weight : (m,) float
         The sums of cos cos dA / r^2 behind ``visible_share``, that is irradiance for radiance 1;
         0 where nothing was rendered. [sr]
+    doubt : (m,) float
+        Standard error of ``visible_share`` by the borders between pixels, and a pixel for what none of them
+        shows; occluders much smaller than a pixel are not seen, and not allowed for. [0..1]
     counters : Counters
     backend : str
         ``software``, or ``gl: `` and the renderer's name.
@@ -93,6 +96,7 @@ class CameraShadows:
     visible_pixels: IntArray
     light_weight: FloatArray
     visible_weight: FloatArray
+    doubt: FloatArray
     counters: Counters
     backend: str
 
@@ -308,7 +312,7 @@ class _Work:
         self.lamp, self.occ, self.viewport, self.naive = lamp, occ, viewport, naive
         self.state = np.zeros(count, np.int8)
         self.pixels = np.zeros((count, 2), np.int64)
-        self.weights = np.zeros((count, 2))
+        self.weights = np.zeros((count, 3))
         self.untouched = np.zeros(count, np.int64)
         self.counts = np.zeros(4, np.int64)
 
@@ -419,6 +423,11 @@ class _Work:
             visible_pixels=self.pixels[:, 1],
             light_weight=self.weights[:, 0],
             visible_weight=self.weights[:, 1],
+            doubt=np.where(
+                rendered,
+                np.hypot(self.weights[:, 2] / np.maximum(self.weights[:, 0], 1e-300), self.viewport**-2.0),
+                0.0,
+            ),
             counters=counters,
             backend=backend,
         )

@@ -102,8 +102,6 @@ LIFT = 1e-9
 """Distance by which rays of the instrument begin and end off surfaces, as a share of the scene's size."""
 ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 """Rounding of a distance, as a share of the coordinates it is a difference of."""
-PIXEL_NOISE = 0.6
-"""Pixels by which the four edges of a rectangle parallel to them are off: each by 1 / sqrt 12, rounded up."""
 ROUND_CORNERS = 24
 """Corners of the regular polygon that stands for a disk when it is cut, checked or drawn."""
 ROUND_ERROR = 0.0022
@@ -803,9 +801,8 @@ class Shader:
         known = ~found.fallback
         answer.seen[known] = found.visible_share[known] * answer.open[known]
         rendered = found.state == CameraState.RENDERED
-        # Not jittered, which would move the frustum off the rim that states are judged by: an edge along the
-        # rows of pixels is off by up to half of one.
-        answer.doubt[rendered] = PIXEL_NOISE / viewport * answer.open[rendered]
+        # Not jittered, which would move the frustum off the rim that states are judged by.
+        answer.doubt[rendered] = found.doubt[rendered] * answer.open[rendered]
         facing = answer.open > 0.0
         answer.state[facing & (found.state == CameraState.NOT_INSHADOW)] = OcclusionState.NOT_INSHADOW
         answer.state[facing & (found.state == CameraState.INSHADOW)] = OcclusionState.INSHADOW

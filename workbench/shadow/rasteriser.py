@@ -17,6 +17,7 @@ overlap.  Arithmetic is double throughout.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -592,10 +593,22 @@ def _hides_all(count, edges, plane, g, lit, vertices):
 
 
 @njit(nogil=True, cache=True)
+def _parts(here, before):
+    """How much of a pixel's error a border between two pixels passes on to the visible share."""
+    if here == before:
+        return 0.0
+    # The rim of the light moves both what is seen of it and all of it.
+    return 1.0 if here != NOT_LIGHT and before != NOT_LIGHT else 0.5
+
+
+@njit(nogil=True, cache=True)
 def _measure(image, frame, n):
-    """(light pixels, visible pixels, light weight, visible weight) of an image.
+    """(light pixels, visible pixels, light weight, visible weight, error of the latter) of an image.
 
     A pixel weighs cos cos dA / r^2: the light's plane gives cos dA = (U x V) . d / (|d| pixels).
+
+    The error: where a border between pixels runs on straight for r of them, the true edge lies anywhere
+    within a pixel of it, by a root mean square of r / sqrt 12; runs are independent of each other.
     """
     size = image.shape[0]
     u, v, o = frame[1], frame[2], frame[0]
@@ -603,11 +616,15 @@ def _measure(image, frame, n):
         (u[1] * v[2] - u[2] * v[1]) * o[0] + (u[2] * v[0] - u[0] * v[2]) * o[1] + (u[0] * v[1] - u[1] * v[0]) * o[2]
     ) / (size * size)
     light, visible = 0, 0
-    light_weight, visible_weight = 0.0, 0.0
+    light_weight, visible_weight, square_error = 0.0, 0.0, 0.0
+    upright = np.zeros(size)
+    above = np.zeros(size)
     for j in range(size):
         y = (j + 0.5) / size
         b0, b1, b2 = o[0] + y * v[0], o[1] + y * v[1], o[2] + y * v[2]
+        level = last = 0.0
         for i in range(size):
+            weight = 0.0
             if image[j, i] != NOT_LIGHT:
                 x = (i + 0.5) / size
                 d0, d1, d2 = b0 + x * u[0], b1 + x * u[1], b2 + x * u[2]
@@ -618,7 +635,21 @@ def _measure(image, frame, n):
                 if image[j, i] == VISIBLE:
                     visible += 1
                     visible_weight += weight
-    return light, visible, light_weight, visible_weight
+            border = _parts(image[j, i], image[j, i - 1]) * max(weight, last) if i > 0 else 0.0
+            if border == 0.0:
+                square_error += upright[i] * upright[i]
+                upright[i] = 0.0
+            upright[i] += border
+            border = _parts(image[j, i], image[j - 1, i]) * max(weight, above[i]) if j > 0 else 0.0
+            if border == 0.0:
+                square_error += level * level
+                level = 0.0
+            level += border
+            last = above[i] = weight
+        square_error += level * level
+    for i in range(size):
+        square_error += upright[i] * upright[i]
+    return light, visible, light_weight, visible_weight, math.sqrt(square_error / 12.0)
 
 
 @njit(nogil=True, cache=True)
@@ -745,8 +776,8 @@ def render_points(
 ):
     """Shadow cameras at a block of points, by this rasteriser.
 
-    Fills ``state`` (m,), ``pixels`` (m, 2) light and visible, ``weights`` (m, 2) the same weighted
-    by cos cos dA / r^2, ``untouched`` (m,) light pixels that no polygon touches (if
+    Fills ``state`` (m,), ``pixels`` (m, 2) light and visible, ``weights`` (m, 3) the same weighted
+    by cos cos dA / r^2 and the error of the latter, ``untouched`` (m,) light pixels that no polygon touches (if
     ``conservative``) and adds to ``counts`` (4,).
     """
     work = _scratch(lamp, occ)
@@ -782,7 +813,7 @@ def render_points(
             if touching == 1:
                 untouched[m] = left
             else:
-                pixels[m, 0], pixels[m, 1], weights[m, 0], weights[m, 1] = _measure(image, frame, n)
+                pixels[m, 0], pixels[m, 1], weights[m, 0], weights[m, 1], weights[m, 2] = _measure(image, frame, n)
 
 
 @njit(nogil=True, cache=True)
@@ -904,7 +935,9 @@ def measure_tiles(picture, tiles, tile_point, frames, normals, viewport, pixels,
         column, row = tile % side, tile // side
         image = picture[row * viewport : (row + 1) * viewport, column * viewport : (column + 1) * viewport]
         m = tile_point[tile]
-        pixels[m, 0], pixels[m, 1], weights[m, 0], weights[m, 1] = _measure(image, frames[tile], normals[m])
+        pixels[m, 0], pixels[m, 1], weights[m, 0], weights[m, 1], weights[m, 2] = _measure(
+            image, frames[tile], normals[m]
+        )
 
 
 @njit(nogil=True, cache=True)
