@@ -27,7 +27,7 @@ from radiosity.form_factors._sampling import place_on_pieces
 from radiosity.patches import PatchMesh, build_mesh
 from radiosity.sensors import Gatherer
 from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, Solution
-from radiosity.solvers.solve import begin, require_matrix_memory, solve_by_matrix
+from radiosity.solvers.solve import begin, most_matrix_elements, require_matrix_memory, solve_by_matrix
 from radiosity.solvers.solve import solve as solve_once
 from workbench.counters import Counters
 from workbench.errors import MemoryForecastError, OptionError
@@ -44,6 +44,8 @@ LOOKS = ((0.02, 64, 32, 2), (0.005, 128, 32, 2), (0.002, 256, 256, 2), (0.0, 256
 """From so large an asked error on: points at which two meshes are compared, rays from each, and looks.
 
 (Sampling moves the estimate by 15 % with the first; what two looks differ by is no part of it.)"""
+MOST_DOUBT = 0.5
+"""Share of the squared difference that may be sampling."""
 ORDER = 0.9
 """Power of the number of elements with which the meshing error falls, until it has been seen to."""
 ORDERS = (0.5, 1.5)
@@ -58,8 +60,8 @@ SAFE = 0.85
 """Share of the asked error below which the estimate must fall: it is one itself."""
 MESHING_SHARE = 0.7
 """Share of the error that the mesh may take."""
-FACTOR_SHARE, MOST_FACTOR_ERROR = 0.5, 0.05
-"""Error of the rows of form factors, over the asked error, and the largest."""
+FACTOR_SHARE, FACTOR_ELEMENTS, MOST_FACTOR_ERROR = 0.5, 500, 0.05
+"""Error of the rows of form factors, over the asked error, up to so many elements; and the largest."""
 LEAST_DIVIDED = 1.7
 """Least ratio of elements to patches: with less, too little of the mesh is divided to tell what it leaves."""
 NEAR = 0.7
@@ -289,36 +291,41 @@ def _first_error(run: _Run) -> float:
     return run.target if run.target > 0 else 0.1
 
 
-def _effort(run: _Run) -> tuple[int, int, int]:
-    """Points, rays and looks of a comparison."""
-    return next(row[1:] for row in LOOKS if _first_error(run) >= row[0])
-
-
-def _look(gatherers: list[Gatherer], where: tuple[FloatArray, FloatArray, IntArray], run: _Run) -> FloatArray:
-    """Indirect irradiance (looks, solutions, points, bands) at points, by the same rays for every solution."""
+def _look(gatherer: Gatherer, where: tuple[FloatArray, FloatArray, IntArray], row: int, run: _Run) -> FloatArray:
+    """Indirect irradiance (looks, points, bands) at points, by the same rays for every solution."""
+    _, _, rays, looks = LOOKS[row]
     points, normals, _ = where
-    _, rays, looks = _effort(run)
+    seeds = range(1, looks + 1)
     return np.array(
-        [
-            [each.indirect(points, normals, rays=rays, counters=run.counters, seed=seed).indirect for each in gatherers]
-            for seed in range(1, looks + 1)
-        ]
+        [gatherer.indirect(points, normals, rays=rays, counters=run.counters, seed=k).indirect for k in seeds]
     )
 
 
-def _difference(fine: FloatArray, coarse: FloatArray, mean: float) -> float:
+def _effort(run: _Run) -> int:
+    """Row of :data:`LOOKS` for the asked error."""
+    return next(row for row, (error, *_) in enumerate(LOOKS) if _first_error(run) >= error)
+
+
+def _difference(fine: FloatArray, coarse: FloatArray, mean: float) -> tuple[float, float]:
     """Root mean square over the points of what two solutions differ by, relative to the mean irradiance.
 
     Of looks (looks, points, bands) with other rays: noise has no part in the products of different looks.
-    Their standard error is added.
+
+    Returns
+    -------
+    difference : float
+        One standard error high.
+    share : float
+        Share of its square that is that standard error.
     """
     if mean <= 0.0:
-        return 0.0
+        return 0.0, 0.0
     off = fine - coarse
     looks = len(off)
     products = ((off.sum(axis=0) ** 2 - (off**2).sum(axis=0)) / (looks * (looks - 1))).mean(axis=1)
-    square = products.mean() + products.std() / math.sqrt(len(products))
-    return math.sqrt(max(float(square), 0.0)) / mean
+    doubt = float(products.std()) / math.sqrt(len(products))
+    square = max(float(products.mean()), 0.0) + doubt
+    return math.sqrt(square) / mean, doubt / square if square > 0 else 0.0
 
 
 def _method(scene: Scene, run: _Run) -> str:
@@ -332,6 +339,11 @@ def _method(scene: Scene, run: _Run) -> str:
         return "matrix"
     run.choices["method"] = f"progressive: {polygons} polygons, whose small facets are clustered"
     return "progressive"
+
+
+def _room_error(elements: int) -> float:
+    """Meshing error of a room of so many elements, about."""
+    return float(ROOM_ERROR / elements**ORDER)
 
 
 def _first_count(run: _Run) -> int:
@@ -377,9 +389,9 @@ class _Patches:
     def solve(self, count: int, stoppable: bool) -> Solution:
         """Solve a mesh of about so many elements, and its patches."""
         run = self.run
-        # No finer than this mesh can be right.
-        finest = max(run.target, 0.3 / count)
-        factor_error = min(run.care * FACTOR_SHARE * finest, MOST_FACTOR_ERROR)
+        # The errors of more and smaller form factors cancel better; and no finer than this mesh can be right.
+        needed = max(run.target * math.sqrt(max(count / FACTOR_ELEMENTS, 1.0)), 0.5 * _room_error(count))
+        factor_error = min(run.care * FACTOR_SHARE * needed, MOST_FACTOR_ERROR)
         asked = run.options | {"method": "matrix", "elements": count, "form_factor_error": factor_error}
         record = begin(self.scene, **asked)
         with record.stage("mesh"):
@@ -422,10 +434,15 @@ class _Patches:
             self.gatherer = Gatherer(solution, shader=self.shader)
         else:
             self.gatherer = self.gatherer.reading(solution)
-        both = [self.gatherer, self.gatherer.reading(coarse)]
-        looks = _look(both, surface_points(mesh, _effort(self.run)[0]), self.run)
+        other = self.gatherer.reading(coarse)
         mean = float(solution.mean_irradiance.mean())
-        difference = _difference(looks[:, 0], looks[:, 1], mean)
+        for row in range(_effort(self.run), len(LOOKS)):
+            where = surface_points(mesh, LOOKS[row][1])
+            looks = (_look(each, where, row, self.run) for each in (self.gatherer, other))
+            difference, doubt = _difference(*looks, mean)
+            # Some more rays are cheaper than a finer mesh for nothing.
+            if doubt <= MOST_DOUBT or difference <= 0.5 * self.run.target:
+                break
         return max(difference, _surface_difference(solution, coarse, mean)), coarse.mesh.element_count
 
     def keep(self, solution: Solution, count: int) -> None:
@@ -437,17 +454,17 @@ class _Patches:
 
 
 def _surface_difference(fine: Solution, coarse: Solution, mean: float) -> float:
-    """Root mean square of what the mean irradiance of the polygons differs by, relative to the mean.
+    """Mean over the area of what the mean irradiance of the polygons differs by, relative to the mean irradiance.
 
-    Points hardly feel what is wrong in the balance between surfaces that send each other much light.
+    Points hardly feel what is wrong in the balance between surfaces that send each other much light.  Not
+    squared: in narrow gaps elements are far off, where points find light afresh.
     """
     key = 2 * fine.mesh.element_polygon + (fine.mesh.element_side < 0)
     which, row = np.unique(key, return_inverse=True)
     off = fine.element_irradiance - coarse.element_irradiance[fine.mesh.element_patch]
-    area = np.bincount(row, fine.mesh.element_area, len(which))
-    each = np.stack([np.bincount(row, fine.mesh.element_area * band, len(which)) for band in off.T], axis=1)
-    square = float(((each / area[:, None]) ** 2).mean(axis=1) @ area / area.sum())
-    return math.sqrt(square) / mean if mean > 0 else 0.0
+    area = fine.mesh.element_area
+    each = np.stack([np.bincount(row, area * band, len(which)) for band in off.T], axis=1)
+    return float(np.sqrt((each**2).mean(axis=1)).sum() / area.sum() / mean) if mean > 0 else 0.0
 
 
 class _Meshes:
@@ -503,13 +520,13 @@ class _Meshes:
         if self.gatherer is None:
             self.gatherer = Gatherer(solution, workers=self.run.options.get("workers"))
             # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
-            self.points = surface_points(build_mesh(self.scene, self.gatherer.geometry), _effort(self.run)[0])
+            self.points = surface_points(build_mesh(self.scene, self.gatherer.geometry), LOOKS[_effort(self.run)][1])
         assert self.points is not None
-        seen = _look([self.gatherer.reading(solution)], self.points, self.run)[:, 0]
+        seen = _look(self.gatherer.reading(solution), self.points, _effort(self.run), self.run)
         before, self.seen = self.seen, seen
         if before is None:
             return None, 0
-        return _difference(seen, before, float(solution.mean_irradiance.mean())), self.run.levels[-1]["elements"]
+        return _difference(seen, before, float(solution.mean_irradiance.mean()))[0], self.run.levels[-1]["elements"]
 
     def keep(self, solution: Solution, count: int) -> None:
         """These methods save themselves within each mesh."""
@@ -580,6 +597,10 @@ def _refine(
         if fits < GROWTH[0]:
             return _finish(run, solution, estimate, "another mesh would not fit into the time")
         count = math.ceil(n * min(want, max(fits, GROWTH[0])))
+        if method == "matrix" and count > most_matrix_elements():
+            count = most_matrix_elements()
+            if count < GROWTH[0] * n:
+                return _finish(run, solution, estimate, "a finer mesh does not fit in memory")
         levels.keep(solution, count)
 
 

@@ -20,12 +20,12 @@ from radiosity.solvers.solution import Checkpoint, EnergyBook, Progress, Solutio
 from workbench.accel.embree import EmbreeAccelerator
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
-from workbench.memory import require_memory
+from workbench.memory import available_bytes, require_memory
 from workbench.record import RunRecord
 from workbench.scene.model import Scene
 from workbench.shadow.occlusion import Shader
 
-__all__ = ["begin", "require_matrix_memory", "solve", "solve_by_matrix", "solve_by_patches"]
+__all__ = ["begin", "most_matrix_elements", "require_matrix_memory", "solve", "solve_by_matrix", "solve_by_patches"]
 
 METHODS = ("auto", "progressive", "direct", "matrix", "hierarchical")
 BUNDLES: dict[str, Callable[..., ColumnFinder]] = {"receiver": ReceiverBundles, "directional": DirectionalBundles}
@@ -45,6 +45,7 @@ ONE_LEVEL_ELEMENTS = 1600
 
 # Bytes an element costs while a mesh is made and solved, beside its bands.
 _ELEMENT_BYTES = 3000
+_MATRIX_BYTES = 40.0  # an entry of a full matrix, with its error and what is needed while they are found
 _FEWER = "ask for fewer elements or a larger max_edge"
 
 
@@ -113,7 +114,12 @@ def _forecast(scene: Scene, elements: int | None, max_edge: float | None, method
 
 def require_matrix_memory(count: float) -> None:
     """Refuse a full matrix of form factors that cannot fit in memory."""
-    require_memory(40.0 * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", _FEWER)
+    require_memory(_MATRIX_BYTES * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", _FEWER)
+
+
+def most_matrix_elements() -> int:
+    """Most elements whose matrix fits in memory, with some to spare."""
+    return int(math.sqrt(0.8 * available_bytes() / _MATRIX_BYTES))
 
 
 def _note_materials(geometry: Geometry, record: RunRecord) -> None:
