@@ -143,11 +143,7 @@ def solve_exchange(
     }
     visible = np.ones(n)
     if closed:
-        # A row far from 1 is no error of form factors: something lies on the element.  What is left
-        # of it is all that exchanges light, and its row sums to 1.
-        sums = exchange.sum(axis=1) / area
-        covered = 1.0 - sums > np.maximum(doubt, COVERED)
-        visible[covered] = sums[covered]
+        visible = _visible_shares(exchange.sum(axis=1) / area, doubt)
         x = close_rows(exchange, area * visible)
         change = 0.0
         for rows in _row_blocks(n):
@@ -155,7 +151,7 @@ def solve_exchange(
             exchange[rows] *= x[rows, None] * x
             change = max(change, float(np.abs(exchange[rows] - before).max()))
         record.errors["row_balance_correction"] = change / scale
-        record.results["covered_elements"] = int(covered.sum())
+        record.results["covered_elements"] = int((visible < 1.0).sum())
     share = np.where(visible > 0, visible, 1.0)[:, None]
     # Light that came from outside or from lamps fell on the visible part, too; emission leaves the whole.
     unshot = solution.unshot
@@ -177,6 +173,15 @@ def solve_exchange(
     record.errors["energy_imbalance"] = book.imbalance(solution.unshot_power)
     solution.converged, solution.stopped = True, "solved"
     return seen
+
+
+def _visible_shares(sums: FloatArray, doubt: FloatArray) -> FloatArray:
+    """Share of each element of an enclosure that sees anything, from its row sum.
+
+    A row far from 1 is no error of form factors: something lies on the element.  What is left of it is all
+    that exchanges light, and its row sums to 1.
+    """
+    return np.where(1.0 - sums > np.maximum(doubt, COVERED), sums, 1.0)
 
 
 def _summed(matrix: FloatArray, start: IntArray) -> FloatArray:
@@ -231,21 +236,22 @@ def solve_matrix(
     lamps = lamps_of_scene(solution.scene, shader.geometry)
     try:
         report(0.0)
-        if lamps:
-            with record.stage("light of lamps"):
-                light = lamp_irradiance(mesh, shader, lamps, record.counters, error=error, closed=closed, seed=seed)
         with record.stage("form factors"):
             exchange, spread = exchange_areas(
                 mesh, shader.geometry, record, error=error, workers=workers, seed=seed, progress=report
             )
+            area = mesh.element_area
+            sums, doubt = exchange.sum(axis=1) / area, spread.sum(axis=1, dtype=np.float64) / area
+        if lamps:
+            with record.stage("light of lamps"):
+                visible = _visible_shares(sums, doubt) if closed else None
+                light = lamp_irradiance(mesh, shader, lamps, record.counters, error=error, visible=visible, seed=seed)
     except KeyboardInterrupt:
         return
     with record.stage("solve"):
-        area = mesh.element_area
         if lamps:
             _receive_lamps(solution, light.irradiance, light.elements)
             square[0] += light.mean_square
-        sums, doubt = exchange.sum(axis=1) / area, spread.sum(axis=1, dtype=np.float64) / area
         if coarse is not None:
             if lamps:
                 emits = np.flatnonzero(coarse.mesh.emission.any(axis=1))

@@ -105,7 +105,7 @@ def lamp_irradiance(
     counters: Counters,
     *,
     error: float = 0.01,
-    closed: bool = False,
+    visible: FloatArray | None = None,
     seed: int = 0,
 ) -> LampLight:
     """Mean irradiance of every element from lamps.
@@ -122,8 +122,9 @@ def lamp_irradiance(
         Gets the counts of the shadow module.
     error : float
         Wanted error of the light at points, see :func:`workbench.shadow.occlusion.estimate`.
-    closed : bool
-        Whether all that a lamp sends must arrive: its light is scaled so.
+    visible : (n,) float, optional
+        In an enclosure the share of each element that sees anything: all that a lamp sends from there must
+        arrive, and its light is scaled so.
     seed : int
     """
     n, everything = mesh.element_count, np.arange(mesh.element_count)
@@ -140,8 +141,10 @@ def lamp_irradiance(
     irradiance, square = np.zeros((n, mesh.bands)), np.zeros(mesh.bands)
     for k, lamp in enumerate(lamps):
         own = emits & np.isin(mesh.element_polygon, lamp.polygons)
-        arrives = float(area @ mean[:, k] / area[own].sum())
-        scale = 1.0 / arrives if closed and arrives > 0.5 else 1.0
+        scale = 1.0
+        if visible is not None:
+            sent, arrives = float(area[own] @ visible[own]), float(area @ mean[:, k])
+            scale = sent / arrives if 0.5 * sent < arrives else 1.0
         power = np.broadcast_to(np.asarray(lamp.power, dtype=np.float64), (mesh.bands,))
         irradiance += scale * mean[:, k, None] * power
         square += (area @ doubt[:, k] ** 2 / area.sum()) * power**2

@@ -15,7 +15,8 @@ from radiosity.patches import build_mesh
 from radiosity.solvers.solve import begin, solve_by_matrix
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
-from workbench.scene.library import unit_cube
+from workbench.scene.library import box_surface, diffuse, unit_cube
+from workbench.scene.model import Scene
 from workbench.shadow.occlusion import Shader
 
 CASES = {case.name: case for case in accuracy_cases()}
@@ -137,3 +138,16 @@ def test_surface_points_lie_on_the_surfaces_equally_many_an_area():
     assert on.all() and (np.einsum("ij,ij->i", points - 0.5, normals) < 0).all()
     # A sixth on each face, to the one point that stratification leaves open at either end.
     assert (np.abs(np.bincount(polygon) - 100) <= 2).all()
+
+
+@pytest.mark.parametrize("error", [0.05, 0.01])
+def test_a_box_that_stands_on_a_glowing_floor_takes_no_light_from_it(error):
+    # Every surface sends 1 - rho + rho: everywhere 1 arrives, but under the box; what the floor emits there is lost.
+    room = box_surface("room", diffuse("wall", 0.7, 0.3), [0, 0, 0], [1, 1, 1], inward=True)
+    box = box_surface("box", diffuse("box", 0.5, 0.5), [0.3, 0.3, 0.0], [0.7, 0.7, 0.4])
+    solution = radiosity.solve(Scene("furnace", (room, box), bands=1, closed=True), error=error)
+    points, normals, polygon = surface_points(solution.mesh, 200, seed=5)
+    under = (points[:, 2] == 0.0) & (np.abs(points[:, :2] - 0.5) < 0.2).all(axis=1)
+    assert 0 < under.sum() < 15
+    found = solution.irradiance(points[~under], normals[~under], own_polygon=polygon[~under], error=0.2 * error)
+    assert np.sqrt(((found.irradiance - 1.0) ** 2).mean()) < 0.5 * error
