@@ -9,12 +9,18 @@ from typing import Any
 import numpy as np
 from radiosity_scenes import cube_with_emitter, huge_plates, l_room, spherical_cap, truths
 
+import radiosity
 from radiosity.accuracy import surface_points
 from radiosity.solvers.solution import Solution
-from workbench.scene.library import diffuse, unit_cube
-from workbench.scene.model import Scene
+from workbench.geometry.tessellation import sphere_mesh
+from workbench.scene.library import diffuse, sphere_surface, unit_cube
+from workbench.scene.model import Scene, Surface
 
 POINTS = 200
+FACETS = 0.02
+"""Distance of facets from the spheres that they stand for, as a share of the radius."""
+FACETS_OFF = 0.003
+"""Most that facets change the mean irradiance of a sphere's parts, relative to the mean."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +117,56 @@ def _bowl(name: str, case: dict) -> AccuracyCase:
     return AccuracyCase(name, scene, lambda s: abs(float(s.mean_irradiance[0]) / case["value"] - 1.0))
 
 
+def _means(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """Mean irradiance and area of each surface."""
+    mesh = solution.mesh
+    area = np.bincount(mesh.element_surface, mesh.element_area)
+    return np.bincount(mesh.element_surface, mesh.element_area * solution.element_irradiance[:, 0]) / area, area
+
+
+def _sphere(name: str, case: dict) -> AccuracyCase:
+    """The inside of a sphere of facets, whose upper part emits: F_ij = A_j / A, up to the facets' angle.
+
+    The facets' own answer, by a finer solve with better form factors, is the truth, once it lies near the sphere's.
+    """
+    (share, _), (rho_1, rho_2) = case["geometry"]["area_fractions"], case["geometry"]["rho"]
+    emits = case["geometry"]["e"]
+    vertices, faces, _, _ = sphere_mesh([0, 0, 0], 1.0, FACETS)
+    faces = faces[:, ::-1]
+    corners = vertices[faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    order = np.argsort(-corners.mean(axis=1)[:, 2])
+    count = int(np.searchsorted(np.cumsum(area[order]) / area.sum(), share)) + 1
+    parts = zip(("upper", "lower"), (rho_1, rho_2), emits, (order[:count], order[count:]), strict=True)
+    surfaces = tuple(Surface.from_mesh(n, diffuse(n, rho, e), vertices, faces[rows]) for n, rho, e, rows in parts)
+
+    scene = Scene("sphere", surfaces, bands=1, closed=True)
+
+    def actual(solution: Solution) -> float:
+        fine, area = _means(radiosity.solve(scene, method="matrix", elements=4 * len(faces), form_factor_error=1e-4))
+        share = area / area.sum()
+        assert _relative_rms(fine, np.full(2, share @ emits / (1.0 - share @ [rho_1, rho_2])), area) < FACETS_OFF
+        return _relative_rms(_means(solution)[0], fine, area)
+
+    return AccuracyCase(name, scene, actual)
+
+
+def _two_spheres(name: str, case: dict) -> AccuracyCase:
+    """Concentric spheres of facets: each sees the inner one as large as its area says, up to the facets' angle."""
+    radii, rho, emits = (np.array(case["geometry"][key]) for key in ("r", "rho", "e"))
+    inner = sphere_surface("inner", diffuse("inner", rho[0], emits[0]), [0, 0, 0], radii[0], facet_error=FACETS)
+    outer = sphere_surface(
+        "outer", diffuse("outer", rho[1], emits[1]), [0, 0, 0], radii[1], facet_error=FACETS, inward=True
+    )
+
+    def actual(solution: Solution) -> float:
+        found, area = _means(solution)
+        factor = np.array([[0.0, 1.0], [area[0] / area[1], 1.0 - area[0] / area[1]]])
+        return _relative_rms(found, factor @ np.linalg.solve(np.eye(2) - rho[:, None] * factor, emits), area)
+
+    return AccuracyCase(name, Scene("spheres", (inner, outer), bands=1, closed=True), actual)
+
+
 def accuracy_cases() -> list[AccuracyCase]:
     """All cases; those of the shared truths only where these are present."""
     cases = [_furnace(rho) for rho in (0.0, 0.8, 0.9, 0.99, 0.999)]
@@ -126,6 +182,10 @@ def accuracy_cases() -> list[AccuracyCase]:
         elif name.startswith("rad/infinite-plates/"):
             rho, emission = case["geometry"]["rho"], case["geometry"]["e"]
             cases.append(_elements(name, huge_plates(rho, emission), case["value"], rho, emission))
+        elif name.startswith("rad/sphere/"):
+            cases.append(_sphere(name, case))
+        elif name.startswith("rad/two-surface/"):
+            cases.append(_two_spheres(name, case))
         elif name.startswith("rad/bowl/"):
             cases.append(_bowl(name, case))
     return cases
