@@ -26,7 +26,7 @@ print(f"{solution.mesh.element_count} elements, estimated error {solution.record
 # %%
 x, y = np.meshgrid(np.linspace(0.5, 3.5, 13), np.linspace(0.5, 5.5, 21))
 plane = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.8)])
-found = radiosity.Gatherer(solution).irradiance(plane, [0, 0, 1], error=0.02)
+found = radiosity.Gatherer(solution).irradiance(plane, [0, 0, 1], error=0.005)
 factor = found.irradiance[:, 0].reshape(x.shape)
 figure, axes = plt.subplots(figsize=(5, 7), layout="constrained")
 filled = axes.contourf(x, y, factor, levels=[0.25, 0.5, 1, 2, 3, 5, 8, 12], cmap="viridis", extend="both")
@@ -49,7 +49,7 @@ uniform = replace(scene, sky=replace(scene.sky, kind="uniform"))
 line = np.column_stack([np.full(30, 2.0), np.linspace(0.3, 5.7, 30), np.full(30, 0.8)])
 figure, axes = plt.subplots(layout="constrained")
 for name, solved in (("overcast", solution), ("uniform", radiosity.solve(uniform, error=0.05))):
-    got = radiosity.Gatherer(solved).irradiance(line, [0, 0, 1], error=0.02)
+    got = radiosity.Gatherer(solved).irradiance(line, [0, 0, 1], error=0.003)
     (drawn,) = axes.semilogy(line[:, 1], got.irradiance[:, 0], label=f"{name} sky")
     axes.semilogy(line[:, 1], got.indirect[:, 0], ls=":", color=drawn.get_color(), label=f"{name}, reflected")
 axes.set_xlabel("distance from the window wall [m]")

@@ -15,7 +15,8 @@ print(f"{scene.name}: {len(scene.surfaces)} surfaces, {scene.bands} bands")
 
 # %% [markdown]
 # The error is the root mean square error of the irradiance over the surfaces, relative to its mean. The
-# solver refines the mesh until two meshes agree that well, and says how the error is made up.
+# solver compares each mesh with a coarser one, refines until they agree well enough, and says how the
+# error is made up.
 
 # %%
 solution = radiosity.solve(scene, error=0.05)
@@ -42,7 +43,7 @@ for name, watts in book.items():
 # %%
 x = np.linspace(0.02, 0.53, 60)
 row = np.column_stack([x, np.zeros(60), np.full(60, 0.04)])
-found = radiosity.Gatherer(solution).irradiance(row, [0, 1, 0], error=0.02)
+found = radiosity.Gatherer(solution).irradiance(row, [0, 1, 0], error=0.005)
 figure, axes = plt.subplots(layout="constrained")
 for band, colour in enumerate(("tab:red", "tab:green", "tab:blue")):
     axes.plot(x, found.irradiance[:, band], color=colour, label=f"band {band}")

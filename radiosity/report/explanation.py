@@ -436,9 +436,7 @@ def draw_ablations(figure: Figure, ablations: Sequence[Ablation], title: str) ->
     axes.set_yticks(place, [f"{item.decision}\nwithout: {item.without}" for item in ordered], fontsize=8)
     axes.invert_yaxis()
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_xlabel(
-        "times as long without the decision: median and range of rounds (below 1: it does not pay in seconds here)"
-    )
+    axes.set_xlabel("times as long without the decision (median and range of rounds; below 1 it does not pay here)")
     axes.set_title(title, fontsize=11)
     axes.grid(axis="x", alpha=0.25)
     handles = [figure_patch(colour, part) for part, colour in colours.items()]
