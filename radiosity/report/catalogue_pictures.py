@@ -117,8 +117,8 @@ def gather_entries() -> list[Failure]:
 # ---- pictures ---------------------------------------------------------------------------------------
 
 
-def _drawn(scene: Scene, technique: str) -> FloatArray:
-    """Radiance (height, width) of a picture."""
+def _drawn(scene: Scene, technique: str) -> tuple[FloatArray, float]:
+    """Radiance (height, width) of a picture, and the relative error that it states."""
     from radiosity.accuracy import solve
     from radiosity.gather import GatherOptions, PictureGatherer
     from workbench.render.camera import PinholeRays
@@ -126,12 +126,12 @@ def _drawn(scene: Scene, technique: str) -> FloatArray:
 
     assert scene.camera is not None
     if technique != "gathered picture":
-        return render_direct(
-            scene, sampling=technique.removesuffix(" picture"), threshold=0.02, workers=1
-        ).picture.radiance[..., 0]
+        sampling = technique.removesuffix(" picture")
+        return render_direct(scene, sampling=sampling, threshold=0.02, workers=1).picture.radiance[..., 0], math.nan
     solution = solve(scene, elements=64, workers=1, seed=1)
     gatherer = PictureGatherer(solution, GatherOptions(error=ERROR), workers=1, seed=1)
-    return gatherer.draw(PinholeRays.from_camera(scene.camera)).radiance[..., 0]
+    picture = gatherer.draw(PinholeRays.from_camera(scene.camera))
+    return picture.radiance[..., 0], picture.measured_error()
 
 
 def _picture(scene: Scene, technique: str, read: Callable[[FloatArray], float]) -> tuple[float, float]:
@@ -139,9 +139,9 @@ def _picture(scene: Scene, technique: str, read: Callable[[FloatArray], float]) 
         opened, camera = open_rival(technique, scene), scene.camera
         assert camera is not None
         return spread_of(lambda seed: read(opened.picture(camera, samples=RIVAL_SAMPLES, seed=seed)[..., 0]))
-    value = read(_drawn(scene, technique))
-    # A gather states the error that it was asked for; the others state none.
-    return value, ERROR * abs(value) if technique == "gathered picture" else math.nan
+    radiance, stated = _drawn(scene, technique)
+    value = read(radiance)
+    return value, stated * abs(value)
 
 
 def _pictures(

@@ -314,7 +314,8 @@ def measure(
                     report(notes[-1])
                     finest[name] = order[name].index(value) - 1
                     continue
-                stated = math.nan if answer.stated is None else answer.stated
+                told = answer.stated() if callable(answer.stated) else answer.stated
+                stated = math.nan if told is None else told
                 known[place] = Run(
                     name, technique.kind, technique.key, float(value), seed, repeat, seconds, used, prepare,
                     memory.used, error, doubt, stated, **counted(answer.counters),

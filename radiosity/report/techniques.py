@@ -34,11 +34,14 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Answer:
-    """``values`` (n, ...) in the problem's shape, counts of work, and the error that the technique itself states."""
+    """``values`` (n, ...) in the problem's shape, counts of work, and the error that the technique itself states.
+
+    ``stated`` may be a function, called when the seconds have been taken: of a technique that looks again for it.
+    """
 
     values: FloatArray
     counters: Mapping[str, int] = field(default_factory=dict)
-    stated: float | None = None
+    stated: float | Callable[[], float] | None = None
 
 
 @dataclass(frozen=True)
@@ -276,7 +279,7 @@ class Shadows(Problem):
         """Exact cuts, or 4 x 4,096 rays."""
         if kind == "exact":
             found = self._estimate("exact", 0)
-            return Reference("exact cuts", found.values, 0.0, found.stated or 0.0)
+            return Reference("exact cuts", found.values, 0.0, found.stated if isinstance(found.stated, float) else 0.0)
         if kind == "converged":
             return _repeated(lambda seed: self._estimate("rays", seed, samples=4096).values, "4 x 4,096 rays a point")
         return _rival_reference(self, kind, 4096)
@@ -724,7 +727,7 @@ class Pictures(Problem):
         counters = Counters()
         counters.merge(solution.record.counters)
         counters.merge(picture.counters)
-        return Answer(picture.radiance, dict(counters))
+        return Answer(picture.radiance, dict(counters), picture.measured_error)
 
 
 class GlobalPictures(Pictures):
@@ -736,7 +739,8 @@ class GlobalPictures(Pictures):
     def _solution(self, error: float, seed: int) -> Any:
         from radiosity.accuracy import solve
 
-        return solve(self.scene, error=error, workers=self.workers, seed=seed)
+        # As ``radiosity render`` does: the gather refines what it reads.
+        return solve(self.scene, error=min(2.0 * error, 0.5), workers=self.workers, seed=seed)
 
     def _matrix_solution(self, elements: float, seed: int) -> Any:
         from radiosity.solvers.solve import solve
