@@ -15,7 +15,7 @@ from radiosity.report.catalogue_pictures import gather_entries, picture_entries
 from radiosity.report.failures import STATED, Failure, contour_factor, point_irradiance, spread_of
 from radiosity.rivals import open_rival
 from workbench.geometry.flat import Geometry
-from workbench.scene.library import box_surface, diffuse, unit_cube
+from workbench.scene.library import box_surface, diffuse, sphere_surface, unit_cube
 from workbench.scene.model import Light, Material, Scene, Surface
 
 __all__ = ["CATALOGUE"]
@@ -482,12 +482,16 @@ def _solve_entries() -> list[Failure]:
         area = solution.mesh.element_area * (away > 1.0 - 1e-6)
         return float(area @ solution.radiosity[:, 0] / area.sum())
 
+    ball = sphere_surface("ball", diffuse("ball", 0.5, 1.0), [0.0, 0.0, 0.0], 1.0, facet_error=0.1, inward=True)
+    sphere = replace(unit_cube(0.5, 1.0), surfaces=(ball,))
     return [
         _solved("one element a face", "errors of the mesh taken for errors of the solver", room, opposite, far,
                 0.005, group="touching patches", max_edge=1.0,
                 solvers=[solver for solver in SOLVERS if solver != "hierarchical"]),  # which makes elements of its own
         _solved("furnace of 0.999", "stopping at the last change leaves most of the light: e / (1 - rho) = 1000",
                 unit_cube(0.999, 1.0), 1000.0, _mean_radiosity, elements=96),
+        _solved("furnace in a sphere", "what facets of one surface send each other is left out",
+                sphere, 2.0, _mean_radiosity, group="touching patches", elements=64),
         _solved("furnace of 0.5", "rows of form factors that do not sum to 1: e / (1 - rho) = 2",
                 unit_cube(0.5, 1.0), 2.0, _mean_radiosity, elements=96),
         _solved("furnace moved by 1e5", "the same in float32", _moved(unit_cube(0.5, 1.0), 1.0, [1e5, 1e5, -1e5]), 2.0,

@@ -94,6 +94,11 @@ def gather_entries() -> list[Failure]:
     inside = box_surface("inside", diffuse("inside", 0.5, 1.0), [0, 0, 0], [1, 1, 1], inward=True)
     outside = box_surface("outside", diffuse("outside", 0.5), [-2, -2, -2], [3, 3, 3], inward=True)
     boxes = Scene("box in a box", (inside, outside), background=np.zeros(1), bands=1, closed=True)
+    faces = furnace.surfaces
+    # Irradiance in the middle of the face across from a grey emitter, by Galerkin elements on graded meshes.
+    half_lit = replace(
+        furnace, surfaces=(*(replace(face, material=diffuse("wall", 0.5)) for face in faces[:5]), faces[5])
+    )
     entries = [
         _sensors(f"{distance:g} from a lit wall", "near hits", "samples of its elements blow up as 1 / d^2, or miss it",
                  _lit_wall(), _wall_factor([distance, 0, 0]), [distance, 0, 0])
@@ -105,6 +110,8 @@ def gather_entries() -> list[Failure]:
                  furnace, 2.0, [1e-4, 1e-4, 0.0], rivals=("mitsuba",)),
         _sensors("under a plate, beside a lit wall", "near hits", "light read off an element that is half hidden",
                  _lit_wall(plate), _wall_factor([0.2, 0, 0], 0.0, 0.25), [0.2, 0.0, 0.0]),
+        _sensors("the middle of the far face", "near hits", "an element's mean, or the mesh's, taken for the point",
+                 half_lit, 0.395208818, [0.5, 0.5, 0.0], rivals=("mitsuba",)),
         _sensors("a dip between equal corners", "missed small shadows", "corners agree and the dip is not found",
                  dip, whole - hidden, [0, 0, 0]),
         _sensors("direct light once", "near hits", "light of the solution and of the shadow rays, both",
@@ -163,6 +170,14 @@ def picture_entries() -> list[Failure]:
     # The square stands in front of its own shadow: seen at distance 1.5, it covers as much as a square 2 / 1.5 as wide.
     share = (0.6 * 2.0 / 1.5 / seen) ** 2
 
+    # Half a pixel wide, in the middle of one of 8 x 8 pixels: a sixteenth of a pixel in from each of its sides.
+    wide = seen / 8 * (2.0 - 0.01) / 2.0
+    place = np.array([0.05 + 0.5 * seen / 8, 0.02 + 0.5 * seen / 8, 0.0])
+    dot = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]]) * 0.25 * wide
+    middle_of_pixel = (place - eye.eye * [1, 1, 0]) * (2.0 - 0.01) / 2.0 + eye.eye * [1, 1, 0] + [0, 0, 0.01]
+    few = replace(eye, width=8, height=8)
+    speck = replace(black, surfaces=(ground, _flat("speck", 0.0, dot + middle_of_pixel)), camera=few)
+
     down = Camera(np.array([0.5, 0.0, 0.9]), np.array([0.5, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 30.0, 12, 12)
     bright = _lit_wall(camera=down)
     # The middle of each pixel; light changes little across it.
@@ -183,6 +198,10 @@ def picture_entries() -> list[Failure]:
         _pictures("a silhouette", "silhouettes", "a sample a pixel takes edge pixels for all or nothing", black,
                   1.0 - share, lambda picture: float(picture.mean()), (*PICTURES, "mitsuba", "radiance"), 0.003,
                   {"aliased picture": "one sample a pixel: edges are steps"}),
+        _pictures("a square smaller than a pixel", "missed small shadows", "corners of the pixel agree", speck,
+                  1.0 - 0.25 / 64, lambda picture: float(picture.mean()), (*PICTURES, "mitsuba", "radiance"), 0.001,
+                  {"aliased picture": "one sample a pixel"} | dict.fromkeys(
+                      ("adaptive picture", "atomic picture"), "a feature between agreeing corners is not known")),
         _pictures("a floor before a lit wall", "fireflies", "single pixels far too bright where rays hit the wall near",
                   bright, 1.0, lambda picture: float((picture / truth).max()), near, 0.03),
         _pictures("dark spots before a lit wall", "fireflies", "single pixels that no ray to the wall lights", bright,
