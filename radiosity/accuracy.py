@@ -508,6 +508,10 @@ class _Meshes:
             "tolerance": min(0.1 * finest, 0.01),
             "form_factor_error": min(run.care * 2.0 * finest, 0.02),
         }
+        if self.method == "hierarchical":
+            # Links are found as well as their elements need; the points take direct light themselves.
+            del asked["form_factor_error"]
+            asked["direct_in_mesh"] = False
         return solve_once(
             self.scene,
             progress=_watched(self.progress, run, f"mesh {len(run.levels) + 1}, about {count} elements", stoppable),
