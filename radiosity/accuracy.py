@@ -75,6 +75,8 @@ COST_POWER = 1.7
 """Power of the number of elements with which the seconds grow."""
 GATHERED = 5.0
 """Number of elements times the sum of squared form factors from a point to them: 1 in a sphere, 3 to 6 in rooms."""
+LINK_ORDER = 0.8
+"""Order of hierarchical solves: links are found as well as elements are, and miss what falls slowly."""
 MATRIX_POLYGONS = 2000
 """Scenes of at most so many polygons are solved with the full matrix."""
 MOST_LEVELS = 12
@@ -580,6 +582,8 @@ def _refine(
         best, stuck = solution, 0
         run.levels.append({"elements": n, "coarse_elements": coarse, "difference": difference})
         order = _order(run.levels)
+        if method == "hierarchical":
+            order = min(order, LINK_ORDER)
         meshing = math.inf
         if difference is not None:
             meshing = difference / ((n / coarse) ** order - 1.0) if difference > 0 else 0.0

@@ -505,3 +505,21 @@ def test_saved_solutions_come_back_and_are_drawn(tmp_path):
     poly = solution.to_pyvista()
     assert poly.n_cells == len(solution.mesh.piece_element)
     assert radiosity.render_preview(solution, 40, 30).shape[0] == 30
+
+
+def test_an_error_asked_of_links_is_kept():
+    # Indirect light in the cube, everywhere, against the full matrix to a tenth of that.
+    scene = cube_with_emitter(0.5, 0.5)
+    judge, solution = (
+        radiosity.solve(scene, method=method, error=error, workers=1)
+        for method, error in (("matrix", 0.002), ("hierarchical", 0.02))
+    )
+    assert solution.converged and solution.record.results["target_reached"]
+    points, normals, polygon = surface_points(judge.mesh, 200, seed=3)
+    found, exact = (
+        s.irradiance(points, normals, own_polygon=polygon, error=2e-3, rays=1024) for s in (solution, judge)
+    )
+    off = found.irradiance - exact.irradiance
+    actual = np.sqrt((off**2).mean()) / exact.irradiance.mean()
+    assert actual < 0.02
+    assert solution.record.errors["estimate"]["total"] > actual / 3
