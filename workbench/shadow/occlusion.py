@@ -96,8 +96,8 @@ FRAMES = 4
 """Senders whose frames are kept."""
 LEAST_MEAN = 0.05
 """``auto``: of darker scenes the error is asked relative to this share of the unoccluded irradiance."""
-BLOCK_POINTS = 512
-"""Points a block of work on one thread, at least."""
+BLOCK_POINTS, CUT_POINTS = 4096, 256
+"""Points a block of work on one thread, at least: to be settled by culls, and to be cut."""
 LIFT = 1e-9
 """Distance by which rays of the instrument begin and end off surfaces, as a share of the scene's size."""
 ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
@@ -621,7 +621,9 @@ class Shader:
             )  # fmt: skip
             return tally
 
-        for tally in self._blocks(work, count, min(64, -(-load // BLOCK_POINTS))):
+        for tally in self._blocks(
+            work, count, min(64, -(-load // (BLOCK_POINTS if limit == CUT_LIMIT else CUT_POINTS)))
+        ):
             if task.method in _UNCULLED:
                 task.counters.add(closed_forms=tally[CLOSED])
             else:

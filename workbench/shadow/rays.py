@@ -24,6 +24,8 @@ _G2 = 1.3247179572447460
 
 NOISE = 0.64
 """Measured on a tessellated torus: K rays leave an error of NOISE K^-3/4 of a visible share."""
+SHARED_RAYS = 8192
+"""More rays than these are spread over threads."""
 PRIOR = 4.0
 """Degrees of freedom for which that measurement counts in the standard error of a point."""
 
@@ -207,6 +209,8 @@ def visible_shares(
     edges = np.concatenate([[0.0], np.cumsum(area) / area.sum()])
     centre, scale = tracer.frame
     step = max(1, BLOCK_RAYS // count)
+    if len(points) * count > SHARED_RAYS:
+        step = min(step, -(-len(points) // workers))
 
     def block(first: int) -> None:
         last = min(first + step, len(points))
