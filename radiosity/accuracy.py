@@ -304,9 +304,10 @@ def _look(gatherer: Gatherer, where: tuple[FloatArray, FloatArray, IntArray], ro
     )
 
 
-def _effort(run: _Run) -> int:
-    """Row of :data:`LOOKS` for the asked error."""
-    return next(row for row, (error, *_) in enumerate(LOOKS) if _first_error(run) >= error)
+def _effort(run: _Run, elements: int) -> int:
+    """Row of :data:`LOOKS` for the asked error, or for what so many elements may reach."""
+    wanted = run.target if run.target > 0 else _room_error(elements)
+    return next(row for row, (error, *_) in enumerate(LOOKS) if wanted >= error)
 
 
 def _difference(fine: FloatArray, coarse: FloatArray, mean: float) -> tuple[float, float]:
@@ -439,7 +440,7 @@ class _Patches:
             self.gatherer = self.gatherer.reading(solution)
         other = self.gatherer.reading(coarse)
         mean = float(solution.mean_irradiance.mean())
-        for row in range(_effort(self.run), len(LOOKS)):
+        for row in range(_effort(self.run, mesh.element_count), len(LOOKS)):
             where = surface_points(mesh, LOOKS[row][1])
             seen = [_look(each, where, row, self.run) for each in (self.gatherer, other)]
             difference, doubt = _difference(seen[0], seen[1], mean)
@@ -527,13 +528,17 @@ class _Meshes:
         if self.gatherer is None:
             self.gatherer = Gatherer(solution, workers=self.run.options.get("workers"))
             # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
-            self.points = surface_points(build_mesh(self.scene, self.gatherer.geometry), LOOKS[_effort(self.run)][1])
+            self.points = surface_points(build_mesh(self.scene, self.gatherer.geometry), LOOKS[self._row()][1])
         assert self.points is not None
-        seen = _look(self.gatherer.reading(solution), self.points, _effort(self.run), self.run)
+        seen = _look(self.gatherer.reading(solution), self.points, self._row(), self.run)
         before, self.seen = self.seen, seen
         if before is None:
             return None, 0
         return _difference(seen, before, float(solution.mean_irradiance.mean()))[0], self.run.levels[-1]["elements"]
+
+    def _row(self) -> int:
+        """Row of :data:`LOOKS`, one for all meshes: they are compared at the same points."""
+        return _effort(self.run, BUDGET_ELEMENTS)
 
     def keep(self, solution: Solution, count: int) -> None:
         """These methods save themselves within each mesh."""
