@@ -53,7 +53,7 @@ ORDERS = (0.5, 1.5)
 """Orders that are believed when seen."""
 ROOM_ERROR = 1.8
 """Meshing error of a room, times the number of elements to the power ``ORDER``: the first guess (Cornell box)."""
-MOST_FIRST = 450
+MOST_FIRST = 700
 """Most elements of the first mesh: what it tells is worth more than any guess."""
 BUDGET_ELEMENTS = 64
 """Most elements of the first mesh where time is limited: it is solved whatever it takes."""

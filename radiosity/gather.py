@@ -57,8 +57,8 @@ DIRECT_SHARE = 4
 """Of so many rays in a subdivided pixel one is a place at which direct light is found."""
 SPACING = 0.5
 """Nodes stand no further apart than this share of the harmonic mean distance to what lights them."""
-PILOT_RAYS = 128
-"""Rays of a bundle before it is known how many are needed."""
+PILOT_RAYS = (16, 128)
+"""Rays of a bundle before it is known how many are needed: as many as 0.03 of error needs, within these."""
 NODE_ERROR = 1.5
 """Standard error of a node, as a share of the picture's error: a fit averages over a few nodes."""
 NOISE = 2.5
@@ -110,6 +110,13 @@ class GatherOptions:
             raise OptionError(f"error: found {self.error}, expected a number between 0 and 1")
         if self.rays is not None and not 1 <= self.rays <= 65536:
             raise OptionError(f"rays: found {self.rays}, expected 1 to 65536")
+
+    @property
+    def pilot_rays(self) -> int:
+        """Rays of a bundle before it is known how many are needed."""
+        return int(
+            np.clip(2 ** round(math.log2(PILOT_RAYS[1]) + 4.0 / 3.0 * math.log2(0.03 / self.error)), *PILOT_RAYS)
+        )
 
     @property
     def passes(self) -> int:
@@ -727,7 +734,7 @@ class _Tile:
             found = gatherer.indirect(*where, rays=rays, counters=self.counters, seed=seed)
         else:
             found = gatherer.indirect(
-                *where, rays=PILOT_RAYS, counters=self.counters, error=NODE_ERROR * self.options.error,
+                *where, rays=self.options.pilot_rays, counters=self.counters, error=NODE_ERROR * self.options.error,
                 direct=self.light.direct[rows], seed=seed,
             )  # fmt: skip
         spread = np.concatenate([found.standard_error, found.standard_error], axis=1)

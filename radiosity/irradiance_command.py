@@ -246,7 +246,10 @@ def _summary(
         lines.insert(1, f"error of the solution: {estimate['total']:.2g} of the mean irradiance over all surfaces")
     if not record.results["sampling_error_reached"]:
         asked = record.settings["sampling_error"]
-        lines.append(f"sampling did not come down to {asked:.2g}: that takes more rays a point than can be had")
+        lines.append(
+            f"sampling did not come down to the {asked:.2g} that it was left: more rays a point than can be had, or"
+            " views too crowded to be cut exactly"
+        )
     if dark:
         lines.append(f"{dark} points receive nothing: behind or inside a surface, or turned away from all light")
     if out_path != "-":
