@@ -913,10 +913,10 @@ def estimate(
         or only where the plane-vertex check leaves occluders; exact cuts where no camera sees well.
         ``shaft`` -- shafts and light pyramids first, exact cuts of short lists, rays for the rest.
         ``exact`` -- every point cut exactly, the light quartered where it is crowded.
-        ``auto`` -- shafts and light pyramids first, exact cuts of short lists; past long ones, lines over
-        the light cut by silhouettes (:mod:`workbench.shadow.silhouette`), as many as ``error`` asks.
-        What has panes before it, or more edges than lines are worth, gets rays, and only at as many
-        points of a tile as a smooth fit needs.
+        ``auto`` -- shafts and light pyramids first, exact cuts of short lists; past longer ones what is
+        cheapest in each tile at the asked ``error``: exact cuts, lines over the light cut by silhouettes
+        (:mod:`workbench.shadow.silhouette`), or rays, which panes need.  Where the light blurs all that lies
+        between them, some points of a flat tile stand for the others by a cubic fit that foretells each of them.
 
         Lights without extent are settled by their one ray, whatever the method.  Linear lights are
         exact by ``exact``, ``shaft`` and ``auto``.  A disk is sampled, cut and drawn as a regular polygon
