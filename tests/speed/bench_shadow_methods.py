@@ -37,7 +37,7 @@ PLAN = [
     ("camera-optimised", (16, 64, 256, 1024)),
 ]
 HERE = Path(__file__).resolve().parents[2]
-EXTERNAL = ("cornell-mcguire/CornellBox-Sphere.obj", "cornell-mitsuba/scene_mitsuba.xml", "nff-spd/tree_11.nff")
+EXTERNAL = ("cornell-mcguire/CornellBox-Sphere.obj", "godot-room/room.glb", "nff-spd/tree_11.nff")
 
 
 def scenes() -> list[str]:
