@@ -316,6 +316,24 @@ def test_auto_meets_its_asked_error_by_rays_and_fits(torus, monkeypatch):
     assert found.counters["sender_lines"] == 0
 
 
+def test_auto_takes_what_is_cheapest_at_the_asked_error(torus):
+    # Little asked of few points: a handful of rays at each, and no preparation of lines.
+    found = torus.estimate(grid_points(10), UP, SQUARE, "auto", error=0.2)
+    assert found.counters["sender_lines"] == 0
+    assert 0 < found.counters["rays"] <= 64 * 100
+    # Much asked of many: lines, and no rays but the pilot's.
+    found = torus.estimate(grid_points(72), UP, SQUARE, "auto", error=1e-3)
+    assert found.counters["sender_lines"] > 0
+    assert found.counters["rays"] <= 2 * PILOT_POINTS * PILOT_RAYS
+    # Long lists, but of few points: cut, without any error.
+    leaves = np.random.default_rng(8).uniform([-1, -1, 0.5], [1, 1, 1.5], (40, 3))
+    shader = Shader(geometry_of([leaf + [[0, 0, 0], [0.2, 0, 0], [0, 0.2, 0.1]] for leaf in leaves]), 1)
+    found = shader.estimate(plane_points(300), UP, SQUARE, "auto", error=1e-3)
+    assert found.counters["exact_cuts"] > 100
+    assert found.counters["sender_lines"] == 0
+    assert not found.standard_error.any()
+
+
 def test_panes_before_a_tessellated_occluder_dim_and_hide(torus):
     # A wide pane of transmittance 1/2 above the torus halves all that passes.
     pane = rectangle(-FAR, FAR, -FAR, FAR, 1.5)

@@ -92,8 +92,8 @@ PREPARE_NS, PREPARED_NS = 3000.0, 150.0
 """Nanoseconds a piece of all geometry before the first line is drawn, and with a sender that was asked before."""
 FILL_NS = 2e6
 """Nanoseconds of fits to rays, however few the points are."""
-FRAMES = 4
-"""Senders whose frames are kept."""
+FRAMES, FRAMED_PIECES = 16, 1_000_000
+"""Senders whose frames are kept, at most, and pieces in all of them: some 100 MB."""
 LEAST_MEAN = 0.05
 """``auto``: of darker scenes the error is asked relative to this share of the unoccluded irradiance."""
 BLOCK_POINTS, CUT_POINTS = 4096, 256
@@ -716,7 +716,7 @@ class Shader:
         if frame is None:
             frame = SenderFrame.build(self.geometry, self._edges, ring, normal)
         self._frames[key] = frame
-        while len(self._frames) > FRAMES:
+        while len(self._frames) > max(1, min(FRAMES, FRAMED_PIECES // max(self.geometry.piece_count, 1))):
             self._frames.pop(next(iter(self._frames)))
         return frame
 
