@@ -3,9 +3,10 @@
     python tests/speed/bench_charts.py [-o out/charts] [--only NAME] [--docs] [--fit] [--against FOLDER]
 
 Charts go on where they were interrupted; rivals that are not installed are left out with a reason.
-Prints, and writes to summary.md, the seconds to each error.  ``--docs`` copies the charts to docs/,
-``--fit`` writes radiosity/report/cost_table.json from the records, ``--against`` compares with the
-charts of another folder: counts and errors exactly, and the order of the frontiers.
+Prints, and writes to summary.md, the seconds to each error.  ``--docs`` also draws the matrix of failures and
+the explanation of README, and copies all figures to docs/; ``--fit`` writes
+radiosity/report/cost_table.json from the records; ``--against`` compares with the charts of another
+folder: counts and errors exactly, and the order of the frontiers.
 """
 
 from __future__ import annotations
@@ -31,6 +32,12 @@ CHARTS = {
     "render-cornell": ["cornell-box", "--what", "render", "--reference", "mitsuba"],
     "picture-cornell": ["cornell-box", "--what", "picture", "--reference", "mitsuba"],
 }
+FIGURES = {
+    "stability": ["stability"],
+    "explain-cornell": ["explain", "cornell-box", "--error", "0.05", "--repeats", "5"],
+}
+"""The other figures of README that are drawn from measurements: NAME.png from the command."""
+PROGRAM = [sys.executable, "-c", "from radiosity.cli import main; main()"]
 LIMIT = "2"
 """Seconds of a run after which finer settings of its technique are left out."""
 
@@ -42,8 +49,19 @@ def run(folder: Path, name: str, against: Path | None) -> int:
         arguments[-1] = "converged"
     if against is not None:
         arguments += ["--compare", str(against / name)]
-    command = [sys.executable, "-c", "from radiosity.cli import main; main()", "chart", *arguments]
-    return subprocess.run([*command, "--limit", LIMIT, "-o", str(folder / name)], check=False).returncode
+    command = [*PROGRAM, "chart", *arguments, "--limit", LIMIT, "-o", str(folder / name)]
+    return subprocess.run(command, check=False).returncode
+
+
+def draw_others(folder: Path) -> list[str]:
+    """Draw the other figures and copy them to docs; names of those that failed."""
+    failed = []
+    for name, arguments in FIGURES.items():
+        print(f"== {name}", flush=True)
+        code = subprocess.run([*PROGRAM, *arguments, "-o", str(folder / name)], check=False).returncode
+        failed += [name] if code != 0 else []
+        shutil.copy(folder / name / f"{arguments[0]}.png", Path(f"docs/{name}.png"))
+    return failed
 
 
 def summary(folder: Path) -> str:
@@ -93,6 +111,8 @@ if __name__ == "__main__":
             print(f"== {chart}: {time.perf_counter() - start:.0f} s", flush=True)
             if asked.docs:
                 shutil.copy(asked.o / chart / "chart.png", Path(f"docs/chart-{chart}.png"))
+    if asked.docs and not asked.only:
+        failed += draw_others(asked.o)
     table = summary(asked.o)
     (asked.o / "summary.md").write_text(table)
     print(table)
