@@ -288,6 +288,8 @@ def _mesh_polygon(rings: list[FloatArray], pieces: list[FloatArray], edge: float
             part = shapely.geometry.polygon.orient(part)
             loops = [np.asarray(part.exterior.coords)[:-1]] + [np.asarray(r.coords)[:-1] for r in part.interiors]
             add(cell, convex_pieces([rings[0][0] + loop @ frame for loop in loops]))
+    if split == 1:  # a hole may leave two parts of one cell: each is an element and a patch
+        return _Part(parts, list(range(len(parts))), parts)
     patch = np.empty(len(parts), dtype=np.int64)
     for number, members in enumerate(groups.values()):
         patch[members] = number

@@ -15,6 +15,7 @@ from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
 from workbench.geometry.polygons import plane_basis, vector_area
 from workbench.scene.library import box_surface, diffuse, sphere_surface, torus_knot_mesh
+from workbench.scene.load import load
 from workbench.scene.model import Scene, Surface
 
 QUAD = np.array([[0, 0, 0], [3, 0, 0], [3, 2, 0], [0, 2, 0.0]])
@@ -260,3 +261,13 @@ def test_bad_options_get_one_line(options, words):
     with pytest.raises(OptionError, match=words) as caught:
         mesh_of(polygon_scene(QUAD), **options)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("elements", [16, 50, 100, 200])
+def test_without_a_split_every_element_is_a_patch(elements):
+    """Also where a hole leaves two parts of one cell of the grid, as a block on the floor of the Cornell box does."""
+    scene = load("cornell-box")
+    mesh = build_mesh(scene, Geometry.from_scene(scene), elements=elements, split=1, cluster=False)
+    assert mesh.patch_count == mesh.element_count
+    np.testing.assert_array_equal(np.sort(mesh.element_patch), np.arange(mesh.element_count))
+    np.testing.assert_allclose(mesh.patch_area, mesh.element_area)
