@@ -15,7 +15,7 @@ from numba import njit
 
 from radiosity.form_factors._contour import contour_integral_in
 from radiosity.form_factors._links import _cell_points
-from radiosity.form_factors._pairs import _PLAIN, CLEARS, HIDES, _heights, crossings, seen_share, verdict
+from radiosity.form_factors._pairs import _PLAIN, CLEARS, HIDES, _axis_verdict, _heights, crossings, seen_share, verdict
 from radiosity.form_factors.analytic import _clip_pair
 from workbench.culling.tally import CLOSED, COMPLEX, DARK, SHAFT_CULL, SHAFT_TEST
 from workbench.geometry.lambert import lambert_piece
@@ -23,9 +23,9 @@ from workbench.geometry.planes import clip_by_plane
 
 ROWS = 128
 """Most cells that wait to be halved."""
-MOST_CELLS = 5_000
+MOST_CELLS = 50_000
 """Cells of a pair after which what is left counts as doubt."""
-SHORT = 24
+SHORT = 48
 """Candidates of a cell that are cut at once; of a longer list the larger end is halved first."""
 
 NARROW = 1.0
@@ -116,10 +116,29 @@ def _between(
     """
     s0, t0 = 8 * row, 8 * row + 4
     s1, t1 = s0 + numbers[row, 0], t0 + numbers[row, 1]
+    sx, sy, sz, sr = _ball(cells, s0, numbers[row, 0])
+    tx, ty, tz, tr = _ball(cells, t0, numbers[row, 1])
+    dx, dy, dz = tx - sx, ty - sy, tz - sz
+    square = dx * dx + dy * dy + dz * dz
+    ra, rb = sr + slack, tr + slack
     used = 0
     for c in range(begin, begin + many):
         k = arena[c]
         tally[SHAFT_TEST] += 1
+        ha = kn[k, 0] * sx + kn[k, 1] * sy + kn[k, 2] * sz - kd[k]
+        hb = ha + kn[k, 0] * dx + kn[k, 1] * dy + kn[k, 2] * dz
+        what = -1
+        if abs(ha) > ra and abs(hb) > rb:
+            what = CLEARS
+            if ha * hb < 0.0:
+                what = _axis_verdict(
+                    ha, hb, sx, sy, sz, dx, dy, dz, square, max(ra, rb), flat, ks[k], ks[k + 1], flow, fhigh, frame, k
+                )
+        if what == CLEARS:
+            tally[SHAFT_CULL] += 1
+            continue
+        if what == HIDES and through[k] == 0.0:
+            return -1
         ka, kb = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], cells, s0, s1)
         la, lb = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], cells, t0, t1)
         if (ka >= -slack and la >= -slack) or (kb <= slack and lb <= slack):
@@ -297,30 +316,36 @@ def _cut_along_touching(
 
 @njit(**_PLAIN)
 def refined_exchange(
-    i, j, begin, many, given, tolerance, corners, start, normal, radius, group, kc, ks, kn, kd, kg, through, frame,
-    flat, flow, fhigh, klow, khigh, slack, fragments, sizes, weights, points, pair, contour, cells, numbers, values,
-    arena, rule, parts, part_sizes, tally,
+    i, j, begin, many, given, tolerance, corners, start, normal, offset, radius, group, kc, ks, kn, kd, kg, through,
+    frame, flat, flow, fhigh, klow, khigh, slack, fragments, sizes, weights, points, pair, contour, cells, numbers,
+    values, arena, rule, parts, part_sizes, tally,
 ):  # fmt: skip
     """Exchange area of two pieces behind the occluders ``given[begin:begin + many]`` and the estimate of its error.
 
     The third value tells whether what was found is all of it; if not, the candidates were too many.
     """
-    m, k = _clip_pair(corners, start[i], start[i + 1], normal[i], corners, start[j], start[j + 1], normal[j], pair)
-    if m <= 0 or k <= 0:
+    m, n = _clip_pair(corners, start[i], start[i + 1], normal[i], corners, start[j], start[j + 1], normal[j], pair)
+    if m <= 0 or n <= 0:
         return 0.0, 0.0, True
     ox, oy, oz = corners[start[j], 0], corners[start[j], 1], corners[start[j], 2]
     swapped = radius[j] < radius[i]
     s, t = (j, i) if swapped else (i, j)
     ring_s, ring_t = (3, 2) if swapped else (2, 3)
-    count_s, count_t = (k, m) if swapped else (m, k)
+    count_s, count_t = (n, m) if swapped else (m, n)
     ns, nt = normal[s], normal[t]
     root = 0
     for c in range(begin, begin + many):
-        if kg[given[c]] == group[i] or kg[given[c]] == group[j]:
+        k = given[c]
+        if kg[k] == group[i] or kg[k] == group[j]:
+            continue
+        _, above = _heights(normal[i, 0], normal[i, 1], normal[i, 2], offset[i], kc, ks[k], ks[k + 1])
+        if above > slack:
+            _, above = _heights(normal[j, 0], normal[j, 1], normal[j, 2], offset[j], kc, ks[k], ks[k + 1])
+        if above <= slack:
             continue
         if root == arena.shape[0]:
             return 0.0, 0.0, False
-        arena[root] = given[c]
+        arena[root] = k
         root += 1
     cuts = _cut_along_touching(
         pair[ring_s], count_s, ox, oy, oz, ns, kc, ks, kn, kd, klow, khigh, arena, 0, root, slack, parts, part_sizes

@@ -78,6 +78,13 @@ def _one_pair(
         if what == HIDES and through[k] == 0.0:
             tally[DARK] += 1
             return 0.0, 0.0, 0
+        # Behind the plane of either end.
+        _, above = _heights(normal[i, 0], normal[i, 1], normal[i, 2], offset[i], kc, ks[k], ks[k + 1])
+        if above > slack:
+            _, above = _heights(normal[j, 0], normal[j, 1], normal[j, 2], offset[j], kc, ks[k], ks[k + 1])
+        if above <= slack:
+            tally[SHAFT_CULL] += 1
+            continue
         if loose:
             # One cut costs no more than a closer look.
             if used >= limit:
@@ -361,9 +368,9 @@ def stripe(
                 if threshold < math.inf and weight * max(doubt, RAY_DOUBT * value * rays) > threshold:
                     refined += 1
                     better, off, whole = refined_exchange(
-                        i, j, begin, many, arena, threshold / weight, corners, start, normal, radius, group, kc, ks,
-                        kn, kd, kg, through, frame, flat, flow, fhigh, klow, khigh, slack, fragments, sizes, weights,
-                        points, pair, contour, cells, numbers, values, short, rule, parts, part_sizes, tally,
+                        i, j, begin, many, arena, threshold / weight, corners, start, normal, offset, radius, group, kc,
+                        ks, kn, kd, kg, through, frame, flat, flow, fhigh, klow, khigh, slack, fragments, sizes,
+                        weights, points, pair, contour, cells, numbers, values, short, rule, parts, part_sizes, tally,
                     )  # fmt: skip
                     if whole:
                         value, doubt, rays = better, off, 0

@@ -54,7 +54,7 @@ COVERED = 0.01
 BLOCK_ROWS = 128
 """Rows of a matrix that a thread takes at once."""
 REFINEMENTS, AIM = 3, 0.8
-"""Most rounds of refining, and the part of the wanted error that they aim at."""
+"""Most rounds of refining, and the part of the wanted error that they aim at: to close rows adds to what is stated."""
 ROUNDS = 200
 """Most rounds of the scaling that closes rows."""
 DENSE_ENTRY, SPARSE_ENTRY = 12, 16
