@@ -23,6 +23,7 @@ from workbench.culling.tally import new_tally
 from workbench.errors import InputError
 from workbench.geometry.coplanar import Occluders, join_coplanar
 from workbench.geometry.flat import Geometry
+from workbench.geometry.lambert import lambert_piece
 from workbench.geometry.planes import clip_by_plane
 from workbench.geometry.polygons import check_polygon, plane_basis
 from workbench.scene.library import diffuse
@@ -38,6 +39,8 @@ MOST_POINTS = 3_000_000
 """Points after which refinement ends, whatever the wanted error: the error says so."""
 FRAGMENTS = 4096
 """Visible fragments of a polygon from one point."""
+THIN = 0.02
+"""Distance of polygons, in extents of one, below which penumbrae are thin layers."""
 GRID = 8
 """Cells along a polygon that has too many event lines to be divided along them."""
 
@@ -73,9 +76,12 @@ class FormFactor(float):
 @njit(nogil=True, cache=True)
 def _cell_values(
     cells, normal, target, corners, start, normals, offset, through, kept, many, fragments, sizes, weights, points,
-    rule, out, tally,
+    rule, hidden, out, tally,
 ):  # fmt: skip
-    """Integral of the visible form factor over each triangle of ``cells`` (n, 3, 3); whether there was room."""
+    """Integral of the visible or the ``hidden`` form factor over each triangle of ``cells`` (n, 3, 3).
+
+    Returns whether there was room.
+    """
     for c in range(cells.shape[0]):
         ax, ay, az = cells[c, 0, 0], cells[c, 0, 1], cells[c, 0, 2]
         ux, uy, uz = cells[c, 1, 0] - ax, cells[c, 1, 1] - ay, cells[c, 1, 2] - az
@@ -85,13 +91,16 @@ def _cell_values(
         total = 0.0
         for k in range(rule.shape[0]):
             s, t = points[k, 1], points[k, 2]
+            x, y, z = ax + s * ux + t * vx, ay + s * uy + t * vy, az + s * uz + t * vz
             share = _pairs.seen_share(
-                ax + s * ux + t * vx, ay + s * uy + t * vy, az + s * uz + t * vz, normal[0], normal[1], normal[2],
-                target, 0, target.shape[0], corners, start, normals, offset, through, kept, many, fragments, sizes,
-                weights, tally,
+                x, y, z, normal[0], normal[1], normal[2], target, 0, target.shape[0], corners, start, normals, offset,
+                through, kept, many, fragments, sizes, weights, tally,
             )  # fmt: skip
             if share < 0.0:
                 return False
+            if hidden:
+                whole = lambert_piece(x, y, z, normal[0], normal[1], normal[2], target, 0, target.shape[0])
+                share = max(whole - share, 0.0)
             total += rule[k] * share
         out[c] = area * total
     return True
@@ -104,6 +113,30 @@ def _halves(cells: FloatArray) -> FloatArray:
     a, b, c = (cells[np.arange(len(cells)), turn[:, k]] for k in range(3))
     m = 0.5 * (a + b)
     return np.stack([np.stack([a, m, c], axis=1), np.stack([m, b, c], axis=1)], axis=1).reshape(-1, 3, 3)
+
+
+def _layers(a: FloatArray, normal: FloatArray, b: FloatArray, ring: FloatArray) -> FloatArray:
+    """Planes (k, 4) beside an occluder's own, where ``a`` and ``b`` lie so close that its penumbra is a thin layer.
+
+    At one, four, sixteen ... times the distance of the polygons: no rule over whole cells would see such a layer.
+    """
+    other = np.cross(b[1] - b[0], b[2] - b[0])
+    n = np.cross(ring[1] - ring[0], ring[2] - ring[0])
+    n /= np.linalg.norm(n)
+    height = (a - ring[0]) @ n
+    after, height_after = np.roll(a, -1, axis=0), np.roll(height, -1)
+    cut = height * height_after < 0
+    slope = float(other @ normal)
+    if not cut.any() or abs(slope) < 0.1 * np.linalg.norm(other):
+        return np.empty((0, 4))
+    at = a[cut] + (height[cut] / (height[cut] - height_after[cut]))[:, None] * (after[cut] - a[cut])
+    gap = float(np.abs((b[0] - at) @ other / slope).max())
+    extent = float(np.ptp(a, axis=0).max())
+    if not 1e-12 * extent < gap < THIN * extent:
+        return np.empty((0, 4))
+    off = gap * 4.0 ** np.arange(int(math.log(extent / gap, 4.0)) + 1)
+    d = ring[0] @ n + np.concatenate([-off, off])
+    return np.column_stack([np.tile(n, (len(d), 1)), d])
 
 
 def _event_lines(a: FloatArray, normal: FloatArray, b: FloatArray, rings: list[FloatArray]) -> FloatArray:
@@ -119,6 +152,7 @@ def _event_lines(a: FloatArray, normal: FloatArray, b: FloatArray, rings: list[F
         for p, q, corner in ((ring, after, b), (b, ends, ring), (ring[:1], after[:1], ring[2:3])):
             n = np.cross((q - p)[:, None], corner[None] - p[:, None]).reshape(-1, 3)
             planes.append(np.column_stack([n, np.einsum("ij,ij->i", n, np.repeat(p, len(corner), axis=0))]))
+    planes += [_layers(a, normal, b, ring) for ring in rings]
     plane = np.concatenate(planes)
     length = np.linalg.norm(plane[:, :3], axis=1)
     plane = plane[length > 1e-12 * size * size] / length[length > 1e-12 * size * size, None]
@@ -178,6 +212,8 @@ class _Blocked:
         corners = max([len(a), len(b), *(len(ring) for ring in self.rings)])
         self.work = _pairs.pair_workspace(corners, FRAGMENTS)[:3]
         self.points = 0
+        # So near that rims are thin layers too: what is hidden has none at the rims, and the whole is known.
+        self.hidden = any(len(_layers(a, normal, b, ring)) for ring in self.rings)
 
     def values(self, cells: FloatArray) -> FloatArray:
         o = self.occluders
@@ -186,7 +222,8 @@ class _Blocked:
         fragments, sizes, weights = self.work
         if not _cell_values(
             np.ascontiguousarray(cells), self.normal, self.b, o.corners, o.start, o.normal, o.offset, o.through,
-            self.kept, len(self.kept), fragments, sizes, weights, _POINTS, _WEIGHTS, out, new_tally(),
+            self.kept, len(self.kept), fragments, sizes, weights, _POINTS, _WEIGHTS, self.hidden, out,
+            new_tally(),
         ):  # fmt: skip
             raise InputError(
                 f"occluders: found so many between the polygons that more than {FRAGMENTS} parts of one are seen from"
@@ -195,7 +232,7 @@ class _Blocked:
         return out
 
     def integral(self, tolerance: float) -> tuple[float, float]:
-        """Exchange area and its estimated error."""
+        """Exchange area seen, or hidden, and its estimated error."""
         lines = _event_lines(self.a, self.normal, self.b, self.rings)
         cells = _fan(_divided(self.a, lines)) if len(lines) <= MOST_LINES else _grid(self.a)
         value = self.values(cells)
@@ -330,10 +367,13 @@ def form_factor(
         if not found:
             value, off = _best_exchange(p, normal_a, not swapped, q, normal_b, 0.5 * tolerance, work)
             off += 0.5 * tolerance
-        elif swapped:
-            value, off = _Blocked(b, normal_b, np.ascontiguousarray(a), found, blockers).integral(tolerance)
         else:
-            value, off = _Blocked(a, normal_a, np.ascontiguousarray(b), found, blockers).integral(tolerance)
+            one, normal, other = (b, normal_b, a) if swapped else (a, normal_a, b)
+            blocked = _Blocked(one, normal, np.ascontiguousarray(other), found, blockers)
+            value, off = blocked.integral(0.9 * tolerance)
+            if blocked.hidden:
+                whole, rounding = _best_exchange(p, normal_a, not swapped, q, normal_b, 0.1 * tolerance, work)
+                value, off = max(whole - value, 0.0), off + rounding + 0.1 * tolerance
         exchange.append(value)
         doubt += off
     return FormFactor(min(math.fsum(exchange) / area_a, 1.0), doubt / area_a)
