@@ -28,13 +28,18 @@ MOST_CELLS = 50_000
 SHORT = 48
 """Candidates of a cell that are cut at once; of a longer list the larger end is halved first."""
 
+CLOSE = 1.0
+"""Height over the other end, in radii of a cell, below which the closed form of the cell is worth its time."""
 NARROW = 1.0
 """Width of a shadow, in radii of a cell, below which the cell's points may miss it."""
 
-PARTS = 48
+PARTS = 64
 """Most parts into which an end is cut beforehand, along what touches it."""
 TOUCHING = 0.02
 """Height over an end, in its own extents, up to which an occluder casts a sharp shadow on it."""
+
+THIN, MOST_LAYERS = 0.3, 10
+"""Distance of the ends, in extents of one, below which a penumbra is a thin layer; most cuts on either side of it."""
 
 UNKNOWN, ROUGH, EXACT = -1, 0, 1
 
@@ -46,7 +51,7 @@ def cell_workspace(occluders, room):
     """
     return (
         np.empty((8 * ROWS, 3)),
-        np.empty((ROWS, 5), dtype=np.int64),
+        np.empty((ROWS, 6), dtype=np.int64),
         np.empty((ROWS, 4)),
         np.empty(32 * (occluders + 1) + 4096, dtype=np.int64),
         np.empty((4, 4)),
@@ -56,8 +61,10 @@ def cell_workspace(occluders, room):
 
 
 @njit(**_PLAIN)
-def _halve(cells, source, size, first, second):
+def _halve(cells, source, size, short, first, second):
     """Halve the polygon of three or four corners at row ``source``, to the rows ``first`` and ``second``.
+
+    Across its longer sides, or, of four, across its ``short`` ones.
 
     Returns the number of corners of both halves.
     """
@@ -83,7 +90,7 @@ def _halve(cells, source, size, first, second):
         across += (r + s - p - q) ** 2
     for axis in range(3):
         p, q, r, s = cells[source, axis], cells[source + 1, axis], cells[source + 2, axis], cells[source + 3, axis]
-        if along >= across:
+        if (along >= across) != short:
             m, n = 0.5 * (p + q), 0.5 * (r + s)
             cells[first, axis], cells[first + 1, axis], cells[first + 2, axis], cells[first + 3, axis] = p, m, n, s
             cells[second, axis], cells[second + 1, axis], cells[second + 2, axis], cells[second + 3, axis] = m, q, r, n
@@ -193,6 +200,8 @@ def _cell_value(
         )
         return value, rounding + 0.1 * allowed, EXACT
     tally[COMPLEX] += 1
+    sx, sy, sz, sr = _ball(cells, s0, size_s)
+    above = abs(nt[0] * (sx - cells[t0, 0]) + nt[1] * (sy - cells[t0, 1]) + nt[2] * (sz - cells[t0, 2]))
     d = nt[0] * cells[t0, 0] + nt[1] * cells[t0, 1] + nt[2] * cells[t0, 2]
     whole = 0.0
     for p in range(corners):
@@ -208,6 +217,12 @@ def _cell_value(
         whole += rule[p, 3] * lambert_piece(
             rule[p, 0], rule[p, 1], rule[p, 2], ns[0], ns[1], ns[2], cells, t0, t0 + size_t
         )
+    if above < CLOSE * sr:
+        # So close the rule does not know the whole well; what is hidden of it is smoother than what is seen.
+        clear, _ = contour_integral_in(
+            cells[s0 : s0 + size_s], size_s, cells[t0 : t0 + size_t], size_t, 0.1 * allowed, contour
+        )
+        return max(clear - max(whole - total, 0.0), 0.0), clear, ROUGH
     return total, whole, ROUGH
 
 
@@ -262,8 +277,58 @@ def _fan(ring, count, part, ox, oy, oz, cells, target):
 
 
 @njit(**_PLAIN)
+def _cut_parts(nx, ny, nz, d, klow, khigh, k, near, tiny, slack, parts, part_sizes, made):
+    """Cut by a plane all parts that an occluder's box comes near to; their number."""
+    for p in range(made):
+        size = part_sizes[p]
+        apart = False
+        for axis in range(3):
+            low, high = math.inf, -math.inf
+            for i in range(size):
+                low, high = min(low, parts[p, i, axis]), max(high, parts[p, i, axis])
+            if klow[k, axis] > high + near or khigh[k, axis] < low - near:
+                apart = True
+        if apart or made == PARTS:
+            continue
+        lo, hi = _heights(nx, ny, nz, d, parts[p], 0, size)
+        if lo >= -tiny or hi <= tiny:
+            continue
+        front = clip_by_plane(parts[p], size, nx, ny, nz, d, slack, parts[made])
+        back = clip_by_plane(parts[p], size, -nx, -ny, -nz, -d, slack, parts[PARTS])
+        if front < 3 or back < 3:
+            continue
+        part_sizes[made], part_sizes[p] = front, back
+        for i in range(back):
+            for axis in range(3):
+                parts[p, i, axis] = parts[PARTS, i, axis]
+        made += 1
+    return made
+
+
+@njit(**_PLAIN)
+def _distance_along(ring, count, ox, oy, oz, nx, ny, nz, d, ns, nt, height_t):
+    """Largest distance of the other end's plane from a ring, measured square to it along where a plane cuts it."""
+    slope = nt[0] * ns[0] + nt[1] * ns[1] + nt[2] * ns[2]
+    if abs(slope) < 0.1:
+        return math.inf
+    largest = math.inf
+    for i in range(count):
+        m = i + 1 if i + 1 < count else 0
+        ax, ay, az = ring[i, 0] + ox, ring[i, 1] + oy, ring[i, 2] + oz
+        bx, by, bz = ring[m, 0] + ox, ring[m, 1] + oy, ring[m, 2] + oz
+        ha, hb = nx * ax + ny * ay + nz * az - d, nx * bx + ny * by + nz * bz - d
+        if ha * hb >= 0.0:
+            continue
+        t = ha / (ha - hb)
+        x, y, z = ax + t * (bx - ax), ay + t * (by - ay), az + t * (bz - az)
+        off = abs((height_t - nt[0] * x - nt[1] * y - nt[2] * z) / slope)
+        largest = off if largest == math.inf else max(largest, off)
+    return largest
+
+
+@njit(**_PLAIN)
 def _cut_along_touching(
-    ring, count, ox, oy, oz, ns, kc, ks, kn, kd, klow, khigh, arena, begin, many, slack, parts, part_sizes
+    ring, count, ox, oy, oz, ns, nt, height_t, kc, ks, kn, kd, klow, khigh, arena, begin, many, slack, parts, part_sizes
 ):  # fmt: skip
     """Convex parts of an end, cut by the planes of the occluders that touch it: there what is seen of it jumps.
 
@@ -287,30 +352,21 @@ def _cut_along_touching(
         lo, hi = _heights(ns[0], ns[1], ns[2], d, kc, ks[k], ks[k + 1])
         if lo > near or hi <= tiny:
             continue
-        before = made
-        for p in range(before):
-            size = part_sizes[p]
-            apart = False
-            for axis in range(3):
-                low, high = math.inf, -math.inf
-                for i in range(size):
-                    low, high = min(low, parts[p, i, axis]), max(high, parts[p, i, axis])
-                if klow[k, axis] > high + near or khigh[k, axis] < low - near:
-                    apart = True
-            if apart:
-                continue
-            lo, hi = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], parts[p], 0, size)
-            if lo >= -tiny or hi <= tiny or made == PARTS:
-                continue
-            front = clip_by_plane(parts[p], size, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], slack, parts[made])
-            back = clip_by_plane(parts[p], size, -kn[k, 0], -kn[k, 1], -kn[k, 2], -kd[k], slack, parts[PARTS])
-            if front < 3 or back < 3:
-                continue
-            part_sizes[made], part_sizes[p] = front, back
-            for i in range(back):
-                for axis in range(3):
-                    parts[p, i, axis] = parts[PARTS, i, axis]
-            made += 1
+        wide = _distance_along(ring, count, ox, oy, oz, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], ns, nt, height_t)
+        for layer in range(2 * MOST_LAYERS + 1):
+            # The plane itself, then both sides of it.
+            step = (layer + 1) // 2
+            off = 0.0
+            if layer > 0:
+                off = wide * 4.0 ** (step - 1) * (1.0 if layer & 1 else -1.0)
+                if not 1e-12 * extent < abs(off) < 0.5 * extent:
+                    break
+            if layer > 0 and wide > THIN * extent:
+                break
+            made = _cut_parts(
+                kn[k, 0], kn[k, 1], kn[k, 2], kd[k] + off, klow, khigh, k, near + abs(off), tiny, slack, parts,
+                part_sizes, made,
+            )  # fmt: skip
     return made
 
 
@@ -348,7 +404,26 @@ def refined_exchange(
         arena[root] = k
         root += 1
     cuts = _cut_along_touching(
-        pair[ring_s], count_s, ox, oy, oz, ns, kc, ks, kn, kd, klow, khigh, arena, 0, root, slack, parts, part_sizes
+        pair[ring_s],
+        count_s,
+        ox,
+        oy,
+        oz,
+        ns,
+        nt,
+        offset[t],
+        kc,
+        ks,
+        kn,
+        kd,
+        klow,
+        khigh,
+        arena,
+        0,
+        root,
+        slack,
+        parts,
+        part_sizes,
     )
     fans_t = 1 if count_t <= 4 else count_t - 2
     cells_s = 0
@@ -366,7 +441,7 @@ def refined_exchange(
         numbers[0, 0] = _fan(parts[cut], part_sizes[cut], part, 0.0, 0.0, 0.0, cells, 0)
         numbers[0, 1] = _fan(pair[ring_t], count_t, number % fans_t, ox, oy, oz, cells, 4)
         # Row -> its candidates (first and number); value, share of the error allowed, error of what it came from.
-        numbers[0, 2], numbers[0, 3], numbers[0, 4] = 0, root, UNKNOWN
+        numbers[0, 2], numbers[0, 3], numbers[0, 4], numbers[0, 5] = 0, root, UNKNOWN, 0
         values[0, 0], values[0, 1], values[0, 2] = 0.0, share, math.inf
         if 2 * root > arena.shape[0]:
             return 0.0, 0.0, False
@@ -395,8 +470,8 @@ def refined_exchange(
                     if numbers[row, 4] == UNKNOWN:
                         return total, doubt, False
                     total += values[row, 0]
-                    doubt += min(values[row, 2], values[row, 0])
-                return total, doubt, True
+                    doubt += min(values[row, 2], 0.5 * values[row, 3])
+                break
             size_s, size_t = numbers[top, 0], numbers[top, 1]
             s0, t0 = 8 * top, 8 * top + 4
             of_target = False
@@ -413,8 +488,14 @@ def refined_exchange(
                     for axis in range(3):
                         cells[8 * row + c, axis] = cells[s0 + c, axis]
                 numbers[row, 0], numbers[row, 1] = size_s, size_t
+                numbers[row, 5] = numbers[top, 5] + (0 if of_target else 1)
             shift = 4 if of_target else 0
-            _halve(cells, s0 + shift, size_t if of_target else size_s, s0 + 8 + shift, s0 + 16 + shift)
+            # A long cell may be smooth along and not across: the first look is across.
+            depth = numbers[top, 5]
+            _halve(
+                cells, s0 + shift, size_t if of_target else size_s, not of_target and depth == 0, s0 + 8 + shift,
+                s0 + 16 + shift,
+            )  # fmt: skip
             allowed = values[top, 1] * 0.7071067811865476
             both = 0.0
             rough = 0
@@ -445,12 +526,13 @@ def refined_exchange(
             if not unknown:
                 # Halves may agree with the whole by chance: at once no more than so much is gained.
                 before = values[top, 2] if values[top, 2] < math.inf else 2.0 * max(both, values[top, 0])
-                error = max(0.4 * abs(both - values[top, 0]), 0.1 * before)
+                error = max(0.4 * abs(both - values[top, 0]), 0.15 * before)
                 if rough == 0:
                     error = 0.0
-            if error <= values[top, 1] and (
-                rough == 0
-                or not _may_be_missed(top, values[top, 1], cells, numbers, values, arena, flow, fhigh, klow, khigh)
+            if rough == 0 or (
+                error <= values[top, 1]
+                and depth > 0
+                and not _may_be_missed(top, values[top, 1], cells, numbers, values, arena, flow, fhigh, klow, khigh)
             ):
                 total += both
                 doubt += error

@@ -53,7 +53,7 @@ COVERED = 0.01
 """Share of a row of a closed scene that must be missing to count as covered (the floor under a box)."""
 BLOCK_ROWS = 128
 """Rows of a matrix that a thread takes at once."""
-REFINEMENTS, AIM = 3, 0.8
+REFINEMENTS, AIM = 5, 0.8
 """Most rounds of refining, and the part of the wanted error that they aim at: to close rows adds to what is stated."""
 ROUNDS = 200
 """Most rounds of the scaling that closes rows."""
@@ -821,6 +821,11 @@ def view_factors(
             )
         row_of, names = _names(mesh, geometry, by)
         areas = np.bincount(row_of, mesh.element_area, len(names)).astype(np.float64)
+        if not (areas > 0).all():
+            flat = int(np.argmin(areas))
+            raise InputError(
+                f"{where}: found {names[flat]} with no area; leave out polygons whose corners lie in a line"
+            )
     with record.stage("prepare"):
         engine = _Engine(mesh, geometry, _Care.for_error(error, mesh.element_count), seed)
         pieces = engine.pieces
@@ -907,12 +912,16 @@ def _all_exchanges(
 
     with _threads(threads, n) as each:
         run(tree.stripes.tolist(), math.inf)
-        for _ in range(REFINEMENTS):
+        tighten = 1.0
+        for turn in range(REFINEMENTS):
             stated = _stated(list(found.values()), areas)
             if stated <= error:
                 break
+            if turn > 0:
+                # Refined pairs kept more doubt than was meant for them.
+                tighten *= AIM * error / stated
             bins = np.sum([stripe.bins for stripe in found.values()], axis=0)
-            threshold = _threshold(bins, AIM * error * float(bins[:, 1].sum()) / stated)
+            threshold = tighten * _threshold(bins, AIM * error * float(bins[:, 1].sum()) / stated)
             again = [node for node, stripe in found.items() if _above(stripe.bins, threshold)]
             run(again, threshold)
             record.results["refined_pairs"] = sum(stripe.refined for stripe in found.values())

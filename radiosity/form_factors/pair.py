@@ -39,6 +39,9 @@ MOST_POINTS = 3_000_000
 """Points after which refinement ends, whatever the wanted error: the error says so."""
 FRAGMENTS = 4096
 """Visible fragments of a polygon from one point."""
+LONG, MOST_SHORTENED = 4.0, 4000
+"""Length of a cell, in distances from the other polygon or in its widths, above which it is halved beforehand; most
+cells that this may make."""
 THIN = 0.02
 """Distance of polygons, in extents of one, below which penumbrae are thin layers."""
 GRID = 8
@@ -231,10 +234,25 @@ class _Blocked:
             )
         return out
 
+    def _shortened(self, cells: FloatArray) -> FloatArray:
+        """Long cells halved until they are no longer than a few distances or widths: no end is passed over."""
+        low, high = self.b.min(axis=0), self.b.max(axis=0)
+        for _ in range(12):
+            longest = np.linalg.norm(np.roll(cells, -1, axis=1) - cells, axis=2).max(axis=1)
+            width = np.linalg.norm(np.cross(cells[:, 1] - cells[:, 0], cells[:, 2] - cells[:, 0]), axis=1) / longest
+            middle = cells.mean(axis=1)
+            gap = np.linalg.norm(np.maximum(np.maximum(low - middle, middle - high), 0.0), axis=1)
+            long = longest > LONG * np.maximum(gap, width)
+            if not long.any() or len(cells) + int(long.sum()) > MOST_SHORTENED:
+                break
+            cells = np.concatenate([cells[~long], _halves(cells[long])])
+        return cells
+
     def integral(self, tolerance: float) -> tuple[float, float]:
         """Exchange area seen, or hidden, and its estimated error."""
         lines = _event_lines(self.a, self.normal, self.b, self.rings)
         cells = _fan(_divided(self.a, lines)) if len(lines) <= MOST_LINES else _grid(self.a)
+        cells = self._shortened(cells)
         value = self.values(cells)
         parts = _halves(_halves(cells))
         fine = self.values(parts).reshape(-1, 4)

@@ -216,3 +216,45 @@ def test_it_is_a_float_that_can_be_copied():
 def test_bad_input_is_refused(arguments, wanted):
     with pytest.raises(InputError, match=wanted):
         radiosity.form_factor(*arguments)
+
+
+def _upright(axis):
+    """A wall from the lower to the upper unit square through their middle, across ``axis``."""
+    wall = np.array([[0, -9, 0], [0, 9, 0], [0, 9, 1], [0, -9, 1]], dtype=float)
+    return wall if axis == 0 else wall[:, [1, 0, 2]]
+
+
+def test_walls_that_touch_both_polygons():
+    # What stays on one side of the wall is the closed form of the halves, or of the quarters of crossing walls.
+    half = polygon_to_polygon(rectangle(-0.5, 0, -0.5, 0.5, 0), rectangle(-0.5, 0, -0.5, 0.5, 1)[::-1])
+    quarter = polygon_to_polygon(rectangle(-0.5, 0, -0.5, 0, 0), rectangle(-0.5, 0, -0.5, 0, 1)[::-1])
+    for walls, exact in (([_upright(0)], half), ([_upright(0), _upright(1)], quarter)):
+        found = radiosity.form_factor(LOWER, UPPER, walls, error=1e-6)
+        assert abs(found - exact) <= found.error <= 1e-6
+    slope = np.array([[-0.5, -9, 0], [0.5, -9, 1], [0.5, 9, 1], [-0.5, 9, 0]])
+    assert radiosity.form_factor(LOWER, UPPER, [slope]) == 0
+
+
+@pytest.mark.parametrize("degrees", [1e-3, 0.1, 1, 90, 179, 179.999])
+def test_a_wall_across_a_wedge(degrees):
+    # Penumbrae beside the wall are as thin as the wedge: what is hidden counts, not what cells see.
+    angle = math.radians(degrees)
+    floor = rectangle(0, 1, 0, 1, 0)
+    leaf = np.array(
+        [[0, 0, 0], [0, 1, 0], [math.cos(angle), 1, math.sin(angle)], [math.cos(angle), 0, math.sin(angle)]]
+    )
+    wall = np.array([[-9, 0.5, -9], [9, 0.5, -9], [9, 0.5, 9], [-9, 0.5, 9]])
+    exact = polygon_to_polygon(floor * [1, 0.5, 1], leaf * [1, 0.5, 1])
+    found = radiosity.form_factor(floor, leaf, [wall], error=1e-6)
+    assert abs(found - exact) <= found.error <= 1e-6
+
+
+@pytest.mark.parametrize("scale, shift", [(1e-3, 0.0), (1e6, 0.0), (1.0, 1e6)])
+def test_scale_and_place_change_nothing(scale, shift):
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    occluder = rectangle(-0.25, 0.25, -0.25, 0.25, 0.5)
+    plain = radiosity.form_factor(LOWER, UPPER, [occluder], error=1e-9)
+    moved = [polygon @ turn.T * scale + shift for polygon in (LOWER, UPPER, occluder)]
+    found = radiosity.form_factor(moved[0], moved[1], [moved[2]], error=1e-6)
+    assert abs(found - plain) <= found.error <= 1e-6

@@ -9,6 +9,7 @@ from view_factor_scenes import closed_room
 
 import radiosity
 from radiosity.form_factors import matrix
+from radiosity.form_factors.analytic import polygon_to_polygon
 from radiosity.form_factors.matrix import close_rows
 from workbench.errors import InputError, MemoryForecastError, OptionError
 from workbench.scene.library import box_surface, diffuse
@@ -223,3 +224,72 @@ def test_whole_polygons_are_the_undivided_mesh():
     # The arrow's two sides see different rooms; neither sees the other or itself.
     rows = [whole.names.index(name) for name in ("arrow", "arrow (back)")]
     assert (whole.dense()[np.ix_(rows, rows)] == 0).all()
+
+
+def wedge(degrees):
+    """Two unit squares that share an edge at an angle, and the form factor of their halves before a wall across."""
+    angle = np.radians(degrees)
+    floor = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    leaf = np.array([[0, 0, 0], [0, 1, 0], [np.cos(angle), 1, np.sin(angle)], [np.cos(angle), 0, np.sin(angle)]])
+    wall = np.array([[-9, 0.5, -9], [9, 0.5, -9], [9, 0.5, 9], [-9, 0.5, 9]], dtype=float)
+    half = [1, 0.5, 1]
+    return floor, leaf, wall, polygon_to_polygon(floor * half, leaf * half)
+
+
+@pytest.mark.parametrize("degrees", [0.1, 1, 30, 90, 179])
+@pytest.mark.parametrize("error", [1e-2, 1e-3])
+def test_a_wall_across_a_wedge(degrees, error):
+    # The wall touches both leaves; beside it lie penumbrae as thin as the wedge.
+    floor, leaf, wall, exact = wedge(degrees)
+    found = radiosity.view_factors(polygon_scene(floor, leaf, wall), error=error)
+    assert abs(found.dense()[0, 1] - exact) <= error
+    assert found.record.errors["stated_row_error"] <= error
+
+
+def test_a_leg_that_stands_on_a_polygon_is_seen_by_it():
+    # A slender leg under a seat: its shadow on the seat is narrow, and touches the seat.
+    seat = np.array([[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0]], dtype=float)
+    side = np.array([[2, -1, -1.5], [2, -1, 0], [2, 2, 0], [2, 2, -1.5]], dtype=float)
+    low, high = 0.47, 0.53
+    leg = [np.array([[x, low, 0], [x, high, 0], [x, high, -0.8], [x, low, -0.8]]) for x in (low, high)] + [
+        np.array([[low, y, 0], [high, y, 0], [high, y, -0.8], [low, y, -0.8]]) for y in (low, high)
+    ]
+    exact = radiosity.form_factor(seat, side, leg, error=1e-8)
+    free = radiosity.form_factor(seat, side)
+    assert free > exact * 1.02
+    for error in (1e-3, 1e-4):
+        found = radiosity.view_factors(polygon_scene(seat, side, *leg), error=error)
+        assert abs(found.dense()[0, 1] - exact) <= error
+        assert found.record.errors["stated_row_error"] <= error
+
+
+def test_only_the_pairs_that_make_the_error_are_refined():
+    import workbench
+
+    loose, fine = (radiosity.view_factors(workbench.load("l-room"), error=error) for error in (0.05, 1e-4))
+    assert "refined_pairs" not in loose.record.results
+    # 14 pieces, 91 pairs.
+    assert 0 < fine.record.results["refined_pairs"] < 91
+    assert fine.record.errors["stated_row_error"] <= 1e-4
+
+
+def test_rows_with_pieces_that_see_each_other_keep_values_and_errors_together():
+    # By surface the inside of a box sees itself; its two halves are one row, whose entry on the diagonal is theirs.
+    room = box_surface("room", diffuse("wall", 0.5), *UNIT, inward=True)
+    found = radiosity.view_factors(Scene("room", (room,), bands=1, closed=True), by="surface", error=1e-4)
+    assert found.dense() == pytest.approx(np.ones((1, 1)), abs=1e-9)
+    assert 0 < errors_of(found)[0, 0] <= 1e-4
+
+
+def test_a_row_that_lacks_much_but_bears_nothing_is_closed():
+    # A coarse matrix of a room in triangles: rows off by more than 1 % are errors, not covers.
+    found = radiosity.view_factors(closed_room(1.0), error=0.1, workers=2)
+    assert found.record.results["covered_rows"] == 0
+    assert np.abs(found.dense().sum(axis=1) - 1).max() < 1e-9
+
+
+def test_polygons_without_area_are_refused():
+    flat = np.array([[0, 0, 0.5], [1, 0, 0.5], [2, 0, 0.5]])
+    square, _ = truth_squares()
+    with pytest.raises(InputError, match="no area"):
+        radiosity.view_factors(polygon_scene(square, flat))
