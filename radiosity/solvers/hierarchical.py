@@ -96,6 +96,8 @@ EXACT_ELEMENTS, EXACT = 12, 1e-8
 """Up to this many elements, if no more may be made, form factors are found to this error: a second at most."""
 FIRST_ERROR, LAST_ERROR = 1e-2, 1e-7
 """Link errors between which a wanted number of elements is sought."""
+BETWEEN_ROUNDS = 1e-3
+"""What row sums may be off while links are still refined."""
 LEAST_LOOSE, LOOSE_ROUNDS = 0.02, 20
 """Least share of a link that row balancing may scale, and rounds before everything is scaled."""
 COVER_POINTS, COVER_RAYS = (8, 16), (1, 6)
@@ -226,8 +228,8 @@ class _Exchange:
             received += loose * self._cross(self.loose, scaled * loose)
         return received * self.scale[:, None]
 
-    def balance(self, wanted: FloatArray) -> None:
-        """Scale rows and columns alike until the rows sum to ``wanted`` (n,).
+    def balance(self) -> None:
+        """Scale rows and columns alike until the rows sum to about what is wanted.
 
         The symmetric scaling of :func:`radiosity.form_factors.matrix.close_rows`, first on what is loose; on
         everything where that does not do.
@@ -238,15 +240,23 @@ class _Exchange:
         share = np.clip(share, LEAST_LOOSE, 1.0)
         self.loose = self._sorted(self.exchange * share)
         self.firm = self._sorted(self.exchange * (1.0 - share))
-        one = np.ones((len(self.area), 1))
+        wanted, one = self.wanted, np.ones((len(self.area), 1))
+        assert wanted is not None
         left = np.maximum(wanted - self._cross(self.firm, one)[:, 0], LEAST_LOOSE * wanted)
         for _ in range(LOOSE_ROUNDS):
             loose = self.loose_scale * self._cross(self.loose, self.loose_scale[:, None])[:, 0]
             self.loose_scale *= np.sqrt(np.divide(left, loose, out=np.ones_like(left), where=loose > 0))
+        self.settle(BETWEEN_ROUNDS)
+
+    def settle(self, limit: float) -> None:
+        """Go on balancing until no row is off by more than ``limit``."""
+        if self.loose is None or self.wanted is None:
+            return
+        one = np.ones((len(self.area), 1))
         for _ in range(100):
             sums = self(one)[:, 0]
-            ratio = np.divide(wanted, sums, out=np.ones_like(sums), where=(sums > 0) & (wanted > 0))
-            if np.abs(ratio - 1.0).max(initial=0.0) < 1e-13:
+            ratio = np.divide(self.wanted, sums, out=np.ones_like(sums), where=(sums > 0) & (self.wanted > 0))
+            if np.abs(ratio - 1.0).max(initial=0.0) < limit:
                 break
             self.scale *= np.sqrt(ratio)
 
@@ -828,7 +838,7 @@ def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, li
     if exchange.wanted is None:
         exchange.wanted, found = _row_targets(solver, exchange)
         if (exchange.wanted != found).any():
-            exchange.balance(exchange.wanted)
+            exchange.balance()
     incident = solution.direct_irradiance
     sent = mesh.emission + mesh.reflectance * incident
     root = np.sqrt(mesh.reflectance)
@@ -981,8 +991,10 @@ def _next_error(solver: _Solver, state: _Round, link_error: float | None) -> flo
         return FIRST_ERROR
     else:
         assert solver.max_elements is not None
-        finer = solver.tree.leaf_count < 0.98 * solver.max_elements and state.error > LAST_ERROR
-        error = 0.5 * state.error if finer else state.error
+        share = solver.tree.leaf_count / solver.max_elements
+        finer = share < 0.98 and state.error > LAST_ERROR
+        # Elements are about as many as the error is small: no smaller than they last, or links alone are refined.
+        error = max(0.5, 0.9 * share) * state.error if finer else state.error
     # Light that goes round more corners than there were rounds.
     return error if finer or solver.waiting() else None
 
@@ -1044,10 +1056,13 @@ def _rounds(
             pause = max(CHECKPOINT_SECONDS, (saved - start) / CHECKPOINT_SHARE)
     assert solution is not None
     with record.stage("solve"):
+        exchange.settle(1e-13)
         limit = 1e-3
-        while remaining_bound(solution) > tolerance and limit > 1e-15:
+        while True:
             limit *= 1e-3
             _solve_links(solver, exchange, solution, limit=limit)
+            if remaining_bound(solution) <= tolerance or limit < 1e-15:
+                break
     solution.converged = not stopped
     solution.stopped = stopped or "tolerance"
     if stopped:
