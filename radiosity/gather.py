@@ -65,6 +65,8 @@ NOISE = 2.5
 """Standard errors of a node by which it may differ from what was foretold without being uneven."""
 TILE = 256
 """Side of a tile. [pixels]"""
+RAYS_AT_ONCE = 1 << 19
+"""Ends of rays from the eye that are held at once inside pixels: more cost gigabytes, and time for them."""
 TILES_IN_MEMORY = 8
 _PIXEL_BYTES = 16000
 """Memory that a pixel of a tile takes while it is drawn, edges counted."""
@@ -224,6 +226,7 @@ class PictureGatherer:
             ),
             workers=self.workers,
         )
+        self.rays_each = self.options.fuzzy_rays if fuzzy else 1
         self._first = self.gatherer.shader.tracer if leads_on else None
         self._sheets = _sheets(self.geometry)
         self._known: dict[int, int] = {}
@@ -578,7 +581,7 @@ class _Tile:
         self.states[whole.pixel] = straight.state
         parts, light, crowded = [whole.take(kept)], [direct[kept]], [straight.crowded[kept]]
         inside = np.flatnonzero(cut)
-        step = max(1, (1 << 19) // self.options.subsamples)
+        step = max(1, RAYS_AT_ONCE // (self.options.subsamples * self.owner.rays_each))
         for first in range(0, len(inside), step):
             pixels = inside[first : first + step]
             fragments, found, dim, places = self._divide(pixels, radiance)
