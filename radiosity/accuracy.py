@@ -40,24 +40,24 @@ __all__ = ["ErrorEstimate", "solve", "surface_points"]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-LOOKS = ((0.02, 64, 32, 2), (0.005, 128, 32, 2), (0.002, 128, 128, 2), (0.0, 256, 256, 2), (0.0, 256, 1024, 4))
+LOOKS = ((0.02, 64, 32, 2), (0.005, 128, 128, 2), (0.002, 256, 128, 2), (0.0, 256, 256, 2), (0.0, 256, 1024, 4))
 """From so large an asked error on: points at which two meshes are compared, rays from each, and looks.
 
 (Sampling moves the estimate by 15 % with the first; what two looks differ by is no part of it.  Where it hides
 the difference, the next row is taken.)"""
-MOST_DOUBT = 0.5
+MOST_DOUBT = 0.35
 """Share of the squared difference that may be sampling."""
 ORDER = 0.9
 """Power of the number of elements with which the meshing error falls, until it has been seen to."""
 ORDERS = (0.5, 1.5)
 """Orders that are believed when seen."""
-ROOM_ERROR = 1.8
+ROOM_ERROR = 2.0
 """Meshing error of a room, times the number of elements to the power ``ORDER``: the first guess (Cornell box)."""
 MOST_FIRST = 700
 """Most elements of the first mesh: what it tells is worth more than any guess."""
 BUDGET_ELEMENTS = 64
 """Most elements of the first mesh where time is limited: it is solved whatever it takes."""
-SAFE = 0.85
+SAFE = 0.9
 """Share of the asked error below which the estimate must fall: it is one itself."""
 MESHING_SHARE = 0.7
 """Share of the error that the mesh may take."""
