@@ -259,7 +259,7 @@ class _Blocked:
         parts = parts.reshape(-1, 4, 3, 3)
         while True:
             # Quartering takes far more than three quarters off, but at a crease of what is seen.
-            error = 0.25 * np.abs(fine.sum(axis=1) - value)
+            error = 0.4 * np.abs(fine.sum(axis=1) - value)
             total = float(error.sum())
             if total <= tolerance or self.points > MOST_POINTS:
                 return math.fsum(fine.ravel().tolist()), total
