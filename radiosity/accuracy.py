@@ -579,7 +579,9 @@ def _refine(
         if run.levels and n < LEAST_GROWTH * run.levels[-1]["elements"]:
             # Clusters of facets come in steps: as good as the same mesh tells nothing.
             if stuck >= MOST_STUCK:
-                return _finish(run, solution, _parts(solution, math.inf), "no finer mesh can be made")
+                # Links with nothing left to refine know what they are off.
+                left = solution.record.errors.get("link_error_estimate", {}).get("total", math.inf)
+                return _finish(run, solution, _parts(solution, left), "no finer mesh can be made")
             stuck, count = stuck + 1, 2 * count
             continue
         start = time.perf_counter()

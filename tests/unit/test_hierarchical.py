@@ -523,3 +523,10 @@ def test_an_error_asked_of_links_is_kept():
     actual = np.sqrt((off**2).mean()) / exact.irradiance.mean()
     assert actual < 0.02
     assert solution.record.errors["estimate"]["total"] > actual / 3
+
+
+def test_where_links_have_nothing_to_refine_the_error_asked_is_reached():
+    # A furnace: whatever is refined, every element gets 1 / (1 - rho).
+    solution = radiosity.solve(unit_cube(0.8, 1.0), method="hierarchical", error=0.01, workers=1)
+    assert solution.converged and solution.record.errors["estimate"]["total"] < 0.01
+    assert np.abs(solution.element_irradiance - 5.0).max() < 0.01 * 5.0
