@@ -79,6 +79,8 @@ LINK_ORDER = 0.8
 """Order of hierarchical solves: links are found as well as elements are, and miss what falls slowly."""
 MATRIX_POLYGONS = 2000
 """Scenes of at most so many polygons are solved with the full matrix."""
+LINKS_ERROR = 0.02
+"""Larger scenes are solved by links, which are cheapest from so large an asked error on, and else by shooting."""
 MOST_LEVELS = 12
 TWICE_ELEMENTS = 64
 """Meshes up to this size are solved twice, to see a difference."""
@@ -341,6 +343,9 @@ def _method(scene: Scene, run: _Run) -> str:
     if polygons <= MATRIX_POLYGONS:
         run.choices["method"] = f"matrix: {polygons} polygons, all form factors at once up to {MATRIX_POLYGONS}"
         return "matrix"
+    if _first_error(run) >= LINKS_ERROR and run.options.get("bundles", "receiver") == "receiver":
+        run.choices["method"] = f"hierarchical: {polygons} polygons, and no less than {LINKS_ERROR:g} asked"
+        return "hierarchical"
     run.choices["method"] = f"progressive: {polygons} polygons, whose small facets are clustered"
     return "progressive"
 
