@@ -40,9 +40,9 @@ IntArray = NDArray[np.int64]
 
 MOST_LIGHTS = 64
 """Emitting polygons of one surface that are each asked as a light; those of a larger mesh are gathered."""
-SOLVE_SHARE = 0.8
+SOLVE_SHARE = 0.9
 """Share of a wanted error for the solve; sampling may take what its estimate leaves of the square, and at least:"""
-LEAST_SHARE = 0.6
+LEAST_SHARE = 0.58
 PILOT_RAYS = (16, 64)
 """Rays a point by which the number of rays is chosen: as many as 0.03 of error needs, within these."""
 PILOT_ERROR = 0.03
