@@ -75,7 +75,7 @@ COST_POWER = 1.7
 """Power of the number of elements with which the seconds grow."""
 GATHERED = 5.0
 """Number of elements times the sum of squared form factors from a point to them: 1 in a sphere, 3 to 6 in rooms."""
-LINK_ORDER = 0.8
+LINK_ORDER = 0.6
 """Order of hierarchical solves: links are found as well as elements are, and miss what falls slowly."""
 MATRIX_POLYGONS = 2000
 """Scenes of at most so many polygons are solved with the full matrix."""
