@@ -11,6 +11,8 @@ with the target:
   is that of its patches, whose form factors are sums of those of the elements: it costs nothing;
 * *form factors* and *visibility*: the stated errors of what formulas and rays found, B F A by B F A;
 * *convergence*: the bound residual / (1 - rho) on light that is still unshot.
+
+Asked ``at`` given points, the error is that at these points, relative to the mean irradiance there.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from radiosity.form_factors._sampling import place_on_pieces
 from radiosity.patches import PatchMesh, build_mesh
@@ -29,8 +31,9 @@ from radiosity.sensors import Gatherer
 from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, Solution
 from radiosity.solvers.solve import begin, most_matrix_elements, require_matrix_memory, solve_by_matrix
 from radiosity.solvers.solve import solve as solve_once
+from workbench.arrays import as_points, as_unit_vectors
 from workbench.counters import Counters
-from workbench.errors import MemoryForecastError, OptionError
+from workbench.errors import InputError, MemoryForecastError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.scene.model import Scene
 from workbench.shadow.occlusion import Shader
@@ -45,6 +48,8 @@ LOOKS = ((0.02, 64, 32, 2), (0.005, 128, 128, 2), (0.002, 256, 128, 2), (0.0, 25
 
 (Sampling moves the estimate by 15 % with the first; what two looks differ by is no part of it.  Where it hides
 the difference, the next row is taken.)"""
+LEAST_LOOKS, ROUGHLY = 64, 0.1
+"""Least looks at given points, each by rays of its own; error to which their mean irradiance is found."""
 MOST_DOUBT = 0.35
 """Share of the squared difference that may be sampling."""
 ORDER = 0.9
@@ -149,6 +154,8 @@ class _Run:
     start: float = field(default_factory=time.perf_counter)
     levels: list[dict[str, Any]] = field(default_factory=list)
     care: float = 1.0
+    at: tuple[FloatArray, FloatArray] | None = None
+    scale: float = 1.0
     counters: Counters = field(default_factory=Counters)
     spent: dict[str, float] = field(default_factory=dict)
     choices: dict[str, str] = field(default_factory=dict)
@@ -157,6 +164,27 @@ class _Run:
     def left(self) -> float:
         """Seconds left of the budget."""
         return self.seconds - (time.perf_counter() - self.start)
+
+    def points(self, mesh: PatchMesh, row: int) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Points, normals and own polygons at which meshes are compared, for a row of :data:`LOOKS`."""
+        count = LOOKS[row][1]
+        if self.at is None:
+            return surface_points(mesh, count)
+        # Few points are looked at several times, each time by other rays.
+        pick = np.arange(len(self.at[0])) if len(self.at[0]) <= count else np.arange(count) * len(self.at[0]) // count
+        pick = np.tile(pick, -(-LEAST_LOOKS // len(pick)))
+        return self.at[0][pick], self.at[1][pick], np.full(len(pick), -1, dtype=np.int64)
+
+    def measure(self, solution: Solution, gatherer: Gatherer) -> float:
+        """The mean irradiance to which errors are relative; all parts of the error are scaled to it."""
+        mean = float(solution.mean_irradiance.mean())
+        if self.at is None:
+            return mean
+        found = gatherer.irradiance(*self.at, error=ROUGHLY)
+        self.counters.merge(found.counters)
+        here = float(found.irradiance.mean())
+        self.scale = mean / here if here > 0 else 1.0
+        return here if here > 0 else mean
 
     def add(self, solution: Solution) -> None:
         self.counters.merge(solution.record.counters)
@@ -168,8 +196,11 @@ def _relative_rms(difference: FloatArray, mean: float) -> float:
     return math.sqrt(float(np.mean(difference**2))) / mean if mean > 0 else 0.0
 
 
-def _parts(solution: Solution, meshing: float | None) -> ErrorEstimate:
-    """The error's parts; without a meshing error, those of the irradiance of the elements themselves."""
+def _parts(solution: Solution, meshing: float | None, scale: float = 1.0) -> ErrorEstimate:
+    """The error's parts; without a meshing error, those of the irradiance of the elements themselves.
+
+    ``scale`` is the mean irradiance of the surfaces over that to which errors are relative.
+    """
     errors, mesh = solution.record.errors, solution.mesh
     share = 1.0
     if meshing is not None:
@@ -177,11 +208,12 @@ def _parts(solution: Solution, meshing: float | None) -> ErrorEstimate:
         # by the squares of what the point sees of each; those sum to GATHERED / n.
         reflected = float(mesh.element_area @ mesh.reflectance.mean(axis=1) / mesh.element_area.sum())
         share = reflected * math.sqrt(min(GATHERED / mesh.element_count, 1.0))
+    share *= scale
     return ErrorEstimate(
         0.0 if meshing is None else meshing,
         share * float(errors.get("irradiance_form_factors_rms", 0.0)),
         share * float(errors.get("irradiance_visibility_rms", 0.0)),
-        float(errors.get("remaining_bound", 0.0)),
+        scale * float(errors.get("remaining_bound", 0.0)),
     )
 
 
@@ -220,6 +252,7 @@ def solve(
     *,
     error: float | None = None,
     budget_seconds: float | None = None,
+    at: tuple[ArrayLike, ArrayLike] | None = None,
     elements: int | None = None,
     max_edge: float | None = None,
     progress: Progress | None = None,
@@ -240,6 +273,9 @@ def solve(
     budget_seconds : float, optional
         Instead or as well: stop refining when another mesh would not fit into this time.  The error
         reached stands in the record.
+    at : (points, normals), optional
+        Both (n, 3): the places that matter.  The error is then that of the irradiance there, relative to its mean
+        there, instead of over all surfaces: a dim room beside a bright yard needs it.
     elements, max_edge, progress, checkpoint, resume, options
         As in :func:`radiosity.solvers.solve.solve`, which this calls.
 
@@ -264,7 +300,17 @@ def solve(
     for name in ("tolerance", "form_factor_error"):
         if options.pop(name, None) is not None:
             raise OptionError(f"{name} and error were both given; the error decides the {name.replace('_', ' ')}")
+    places = None
+    if at is not None:
+        if elements is not None or max_edge is not None:
+            raise OptionError("at and a given mesh were both given; choose one of them")
+        places = as_points(at[0], "at, points"), as_unit_vectors(at[1], "at, normals")
+        if len(places[0]) != len(places[1]):
+            raise InputError(
+                f"at: found {len(places[0])} points and {len(places[1])} normals, expected as many of both"
+            )
     run = _Run(
+        at=places,
         target=error if error is not None else 0.0,
         seconds=budget_seconds if budget_seconds is not None else math.inf,
         options=options,
@@ -281,7 +327,11 @@ def _finish(run: _Run, solution: Solution, estimate: ErrorEstimate, reason: str)
     record.counters, record.seconds = run.counters, run.spent
     record.settings |= run.settings
     record.errors["estimate"] = estimate.as_dict()
-    record.errors["definition"] = "area-weighted RMS error of irradiance over the surfaces / mean irradiance"
+    record.errors["definition"] = (
+        "area-weighted RMS error of irradiance over the surfaces / mean irradiance"
+        if run.at is None
+        else f"RMS error of irradiance at {len(run.at[0])} given points / mean irradiance there"
+    )
     record.results["levels"] = run.levels
     record.results.pop("level_irradiance", None)
     reached = run.target > 0 and estimate.total <= run.target
@@ -444,15 +494,17 @@ class _Patches:
         else:
             self.gatherer = self.gatherer.reading(solution)
         other = self.gatherer.reading(coarse)
-        mean = float(solution.mean_irradiance.mean())
+        mean = self.run.measure(solution, self.gatherer)
         for row in range(_effort(self.run, mesh.element_count), len(LOOKS)):
-            where = surface_points(mesh, LOOKS[row][1])
+            where = self.run.points(mesh, row)
             seen = [_look(each, where, row, self.run) for each in (self.gatherer, other)]
             difference, doubt = _difference(seen[0], seen[1], mean)
             # Some more rays are cheaper than a finer mesh for nothing.
             if doubt <= MOST_DOUBT or difference <= 0.5 * self.run.target:
                 break
-        return max(difference, _surface_difference(solution, coarse, mean)), coarse.mesh.element_count
+        if self.run.at is None:
+            difference = max(difference, _surface_difference(solution, coarse, mean))
+        return difference, coarse.mesh.element_count
 
     def keep(self, solution: Solution, count: int) -> None:
         """Let the caller save a whole mesh, from which a mesh of ``count`` elements follows."""
@@ -513,7 +565,7 @@ class _Meshes:
         asked = run.options | {
             "method": self.method,
             "elements": count,
-            "tolerance": min(0.1 * finest, 0.01),
+            "tolerance": min(0.1 * finest, 0.01) / max(run.scale, 1.0),
             "form_factor_error": min(run.care * 2.0 * finest, 0.02),
         }
         if self.method == "hierarchical":
@@ -533,13 +585,15 @@ class _Meshes:
         if self.gatherer is None:
             self.gatherer = Gatherer(solution, workers=self.run.options.get("workers"))
             # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
-            self.points = surface_points(build_mesh(self.scene, self.gatherer.geometry), LOOKS[self._row()][1])
+            self.points = self.run.points(build_mesh(self.scene, self.gatherer.geometry), self._row())
         assert self.points is not None
-        seen = _look(self.gatherer.reading(solution), self.points, self._row(), self.run)
+        reading = self.gatherer.reading(solution)
+        mean = self.run.measure(solution, reading)
+        seen = _look(reading, self.points, self._row(), self.run)
         before, self.seen = self.seen, seen
         if before is None:
             return None, 0
-        return _difference(seen, before, float(solution.mean_irradiance.mean()))[0], self.run.levels[-1]["elements"]
+        return _difference(seen, before, mean)[0], self.run.levels[-1]["elements"]
 
     def _row(self) -> int:
         """Row of :data:`LOOKS`, one for all meshes: they are compared at the same points."""
@@ -586,7 +640,7 @@ def _refine(
             if stuck >= MOST_STUCK:
                 # Links with nothing left to refine know what they are off.
                 left = solution.record.errors.get("link_error_estimate", {}).get("total", math.inf)
-                return _finish(run, solution, _parts(solution, left), "no finer mesh can be made")
+                return _finish(run, solution, _parts(solution, left, run.scale), "no finer mesh can be made")
             stuck, count = stuck + 1, 2 * count
             continue
         start = time.perf_counter()
@@ -599,7 +653,7 @@ def _refine(
         meshing = math.inf
         if difference is not None:
             meshing = difference / ((n / coarse) ** order - 1.0) if difference > 0 else 0.0
-        estimate = _parts(solution, meshing)
+        estimate = _parts(solution, meshing, run.scale)
         now = time.perf_counter()
         run.spent["error estimate"] = run.spent.get("error estimate", 0.0) + now - start
         run.levels[-1] |= {"seconds": now - run.start} | estimate.as_dict()

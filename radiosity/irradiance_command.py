@@ -106,7 +106,7 @@ def irradiance(
         loaded = workbench.load(scene)
     for note in loaded.notes:
         click.echo(f"note: {note}", err=True)
-    solution = _solution(loaded, directory, elements, error, workers, seed, record)
+    solution = _solution(loaded, directory, elements, rows, error, workers, seed, record)
     parts = _gather(solution, rows, error, workers, seed, record)
     text = _table(rows, parts)
     if out_path == "-":
@@ -133,6 +133,7 @@ def _solution(
     scene: Scene,
     directory: Path | None,
     elements: int | None,
+    rows: NDArray[np.float64],
     error: float,
     workers: int | None,
     seed: int,
@@ -150,7 +151,9 @@ def _solution(
     else:
         with record.stage("solve"):
             if elements is None:
-                solution = radiosity.solve(scene, error=SOLVE_SHARE * error, workers=workers, seed=seed)
+                solution = radiosity.solve(
+                    scene, error=SOLVE_SHARE * error, at=(rows[:, :3], rows[:, 3:]), workers=workers, seed=seed
+                )
             else:
                 tolerance = min(0.01, UNSHOT_SHARE * error)
                 solution = radiosity.solve(scene, elements=elements, tolerance=tolerance, workers=workers, seed=seed)
@@ -243,7 +246,8 @@ def _summary(
     ]
     estimate = record.errors["solution"].get("estimate")
     if estimate is not None:
-        lines.insert(1, f"error of the solution: {estimate['total']:.2g} of the mean irradiance over all surfaces")
+        where = "these points" if record.settings["solution"] is None else "all surfaces"
+        lines.insert(1, f"error of the solution: {estimate['total']:.2g} of the mean irradiance over {where}")
     if not record.results["sampling_error_reached"]:
         asked = record.settings["sampling_error"]
         lines.append(

@@ -27,6 +27,8 @@ TESSELLATED = 64
 """Faces from which a surface counts as tessellated, so that its small facets are clustered."""
 NEAR = 0.05
 """Distance, as a share of an element's edge, within which polygons touch: elements are cut along the lines."""
+VAST, MOST_OF_REST = 0.5, 2.0
+"""A polygon with more than this share of all area counts at most so many times as much as all smaller ones."""
 LEAST_TOUCHING = 0.2
 """Extent, as a share of an element's edge, below which a polygon's contacts are not looked at."""
 COARSE_CLUSTERS = 12
@@ -330,8 +332,8 @@ class _Extents:
                 rows.append((*extent, float(np.linalg.norm(vector_area(rings)) / (extent[0] * extent[1]))))
         return cls(*(np.array(column) for column in zip(*rows, strict=True)))
 
-    def counts(self, edge: float, split: int) -> IntArray:
-        """About how many elements each polygon falls into."""
+    def counts(self, edge: float | FloatArray, split: int) -> IntArray:
+        """About how many elements each polygon falls into, with one largest edge or one a polygon."""
 
         def steps(length: FloatArray) -> FloatArray:
             count = np.maximum(1.0, np.ceil(length / edge - 1e-9))
@@ -342,14 +344,41 @@ class _Extents:
         return np.maximum(1, np.ceil(self.share * along * across)).astype(np.int64)
 
 
-def forecast_elements(scene: Scene, edge: float, split: int = 2, extents: list[_Extents] | None = None) -> int:
-    """About how many elements :func:`build_mesh` makes for a largest edge, without making them."""
-    total = 0
+def _edge_scales(geometry: Geometry) -> FloatArray:
+    """How much longer (q,) the elements' edges are on a polygon that is far larger than all smaller ones together.
+
+    A yard of a thousand times the area of the house on it would else get all elements, and the house none.
+    """
+    area = geometry.polygon_area
+    order = np.argsort(area, kind="stable")
+    counted = area[order].copy()
+    outlier = np.flatnonzero(counted > VAST * area.sum())
+    for k in outlier[outlier > 0].tolist():
+        counted[k] = min(counted[k], MOST_OF_REST * counted[:k].sum())
+    scales = np.empty(len(area))
+    scales[order] = np.sqrt(area[order] / counted)
+    return scales
+
+
+def forecast_elements(
+    scene: Scene,
+    edge: float,
+    split: int = 2,
+    extents: list[_Extents] | None = None,
+    scales: FloatArray | None = None,
+) -> int:
+    """About how many elements :func:`build_mesh` makes for a largest edge, without making them.
+
+    ``scales`` (q,) multiplies the edge for each polygon.
+    """
+    total = first = 0
     for number, surface in enumerate(scene.surfaces):
         sides = 2 if surface.material.two_sided else 1
         if not surface.face_count:
             continue
-        n = (extents[number] if extents is not None else _Extents.of_surface(surface)).counts(edge, split)
+        edges = edge if scales is None else edge * scales[first : first + surface.face_count]
+        first += surface.face_count
+        n = (extents[number] if extents is not None else _Extents.of_surface(surface)).counts(edges, split)
         small = small_facets(surface, edge) if (np.diff(surface.ring_offsets) == 3).all() else ()
         if len(small):
             n[small] = 0
@@ -366,18 +395,18 @@ def forecast_elements(scene: Scene, edge: float, split: int = 2, extents: list[_
     return total
 
 
-def _edge_for(scene: Scene, geometry: Geometry, elements: int, split: int) -> float:
+def _edge_for(scene: Scene, geometry: Geometry, elements: int, split: int, scales: FloatArray) -> float:
     """Largest edge that gives about the asked number of elements, by bisection."""
     extents = [_Extents.of_surface(surface) for surface in scene.surfaces]
     high = 2.0 * geometry.size
-    if forecast_elements(scene, high, split, extents) >= elements:
+    if forecast_elements(scene, high, split, extents, scales) >= elements:
         return math.inf
-    low = math.sqrt(float(geometry.polygon_area.sum()) / (4.0 * elements))
-    while forecast_elements(scene, low, split, extents) < elements and low > 1e-6 * geometry.size:
+    low = math.sqrt(float((geometry.polygon_area / scales**2).sum()) / (4.0 * elements))
+    while forecast_elements(scene, low, split, extents, scales) < elements and low > 1e-6 * geometry.size:
         low *= 0.5
     for _ in range(40):
         middle = math.sqrt(low * high)
-        if forecast_elements(scene, middle, split, extents) > elements:
+        if forecast_elements(scene, middle, split, extents, scales) > elements:
             low = middle
         else:
             high = middle
@@ -453,11 +482,12 @@ def build_mesh(
         raise OptionError(f"elements: found {elements}, expected 1 or more")
     if max_edge is not None and not max_edge > 0:
         raise OptionError(f"max_edge: found {max_edge}, expected a positive length")
-    edge = math.inf
+    edge, scales = math.inf, np.ones(geometry.polygon_count)
     if max_edge is not None:
         edge = max_edge
     elif elements is not None:
-        edge = _edge_for(scene, geometry, elements, split)
+        scales = _edge_scales(geometry)
+        edge = _edge_for(scene, geometry, elements, split, scales)
     # One element a polygon is asked for as such; elements of a mesh end where something stands on them.
     contacts = contact_lines(geometry, NEAR * edge, LEAST_TOUCHING * edge) if math.isfinite(edge) else {}
     edge = min(edge, 4.0 * geometry.size)
@@ -507,12 +537,13 @@ def build_mesh(
             loops = surface.face(face)
             a, b = geometry.polygon_piece_start[number + face : number + face + 2]
             pieces = [geometry.piece(i) for i in range(a, b)]
+            longest = edge * scales[number + face]
             if len(loops) == 1 and len(loops[0]) == 3:
-                part = _mesh_triangle(loops[0], edge, split)
+                part = _mesh_triangle(loops[0], longest, split)
             elif len(loops) == 1 and len(loops[0]) == 4 and len(pieces) == 1:
-                part = _mesh_quad(loops[0], edge, split)
+                part = _mesh_quad(loops[0], longest, split)
             else:
-                part = _mesh_polygon(loops, pieces, edge, split)
+                part = _mesh_polygon(loops, pieces, longest, split)
             if number + face in contacts:
                 part = _cut_at_contacts(part, geometry.polygon_normal[number + face], contacts[number + face])
             for sign in sides:

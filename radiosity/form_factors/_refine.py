@@ -33,6 +33,9 @@ CLOSE = 1.0
 NARROW = 1.0
 """Width of a shadow, in radii of a cell, below which the cell's points may miss it."""
 
+UNSEEN = 0.1
+"""Share of a cell's open exchange that its points may miss where they see nothing, and nothing proves it dark."""
+
 PARTS = 64
 """Most parts into which an end is cut beforehand, along what touches it."""
 TOUCHING = 0.02
@@ -497,7 +500,7 @@ def refined_exchange(
                 s0 + 16 + shift,
             )  # fmt: skip
             allowed = values[top, 1] * 0.7071067811865476
-            both = 0.0
+            both = dim = 0.0
             rough = 0
             unknown = numbers[top, 4] == UNKNOWN
             for half in range(2):
@@ -522,11 +525,17 @@ def refined_exchange(
                 unknown = unknown or state == UNKNOWN
                 rough += state != EXACT
                 both += value
+                if state == ROUGH:
+                    dim += off
             error = math.inf
             if not unknown:
                 # Halves may agree with the whole by chance: at once no more than so much is gained.
                 before = values[top, 2] if values[top, 2] < math.inf else 2.0 * max(both, values[top, 0])
                 error = max(0.4 * abs(both - values[top, 0]), 0.15 * before)
+                if both + values[top, 0] <= 0.0 and numbers[top, 3] == 1:
+                    # No point sees past the one occluder that is left, and nothing proves that none can: a rim may
+                    # lie open between them.  (Several may well hide all together, which no halving proves.)
+                    error = UNSEEN * dim
                 if rough == 0:
                     error = 0.0
             if rough == 0 or (

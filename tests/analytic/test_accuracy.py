@@ -13,10 +13,10 @@ import radiosity
 from radiosity.accuracy import _patches_as_elements, surface_points
 from radiosity.patches import build_mesh
 from radiosity.solvers.solve import begin, solve_by_matrix
-from workbench.errors import OptionError
+from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.scene.library import box_surface, diffuse, unit_cube
-from workbench.scene.model import Scene
+from workbench.scene.model import Scene, Surface
 from workbench.shadow.occlusion import Shader
 
 CASES = {case.name: case for case in accuracy_cases()}
@@ -153,3 +153,33 @@ def test_a_box_that_stands_on_a_glowing_floor_takes_no_light_from_it(error):
     assert 0 < under.sum() < 15
     found = solution.irradiance(points[~under], normals[~under], own_polygon=polygon[~under], error=0.2 * error)
     assert np.sqrt(((found.irradiance - 1.0) ** 2).mean()) < 0.5 * error
+
+
+def test_the_error_can_be_asked_for_where_it_matters():
+    """A dim furnace in a bright yard: the wanted error is that of the dim points, relative to their own mean.
+
+    Inside a closed box of emission e and reflectance rho the irradiance is e / (1 - rho) (conservation of energy),
+    whatever the yard, a thousand times as large and bright, does.
+    """
+    inside = box_surface("furnace", diffuse("dim", 0.5, 1e-3, bands=1), [-1, -1, 0.1], [1, 1, 2.1], inward=True)
+    yard = [[-40, -40, 0], [40, -40, 0], [40, 40, 0], [-40, 40, 0]]
+    roof = [[-40, -40, 9], [-40, 40, 9], [40, 40, 9], [40, -40, 9]]
+    scene = Scene(
+        "yard",
+        (
+            inside,
+            Surface.from_polygons("yard", diffuse("grey", 0.3, bands=1), [np.array(yard, dtype=float)]),
+            Surface.from_polygons("roof", diffuse("bright", 0.3, 1.0, bands=1), [np.array(roof, dtype=float)]),
+        ),
+        bands=1,
+    )
+    points = np.array([[0, 0, 0.1 + 1e-6], [0.5, -0.3, 0.1 + 1e-6]])
+    normals = np.tile([0, 0, 1.0], (2, 1))
+    solution = radiosity.solve(scene, error=0.02, at=(points, normals))
+    found = solution.irradiance(points, normals, error=0.005).irradiance
+    assert np.abs(found / 2e-3 - 1).max() < 0.02
+    assert "given points" in solution.record.errors["definition"]
+    with pytest.raises(InputError, match="as many of both"):
+        radiosity.solve(scene, error=0.02, at=(points, normals[:1]))
+    with pytest.raises(OptionError, match="given mesh"):
+        radiosity.solve(scene, error=0.02, at=(points, normals), elements=50)

@@ -271,3 +271,15 @@ def test_without_a_split_every_element_is_a_patch(elements):
     assert mesh.patch_count == mesh.element_count
     np.testing.assert_array_equal(np.sort(mesh.element_patch), np.arange(mesh.element_count))
     np.testing.assert_allclose(mesh.patch_area, mesh.element_area)
+
+
+def test_a_vast_yard_does_not_take_all_elements():
+    """A third of the elements stays with the house; scenes without an outlier are meshed as before."""
+    house = box_surface("house", diffuse("grey", 0.5, bands=1), [-3, -3, 0], [3, 3, 3])
+    yard = np.array([[-200, -200, -0.1], [200, -200, -0.1], [200, 200, -0.1], [-200, 200, -0.1]])
+    scene = Scene("yard", (house, Surface.from_polygons("yard", diffuse("grey", 0.5, bands=1), [yard])), bands=1)
+    mesh = mesh_of(scene, elements=600)[1]
+    of_house = np.count_nonzero(mesh.element_polygon < 6)
+    assert 0.25 * mesh.element_count < of_house < 0.5 * mesh.element_count
+    # An edge that was asked for is the edge of all.
+    assert np.count_nonzero(mesh_of(scene, max_edge=20.0)[1].element_polygon < 6) == 6
