@@ -222,7 +222,7 @@ class Shadows(Problem):
         return self._by_samples("shaft", "shaft", (4, 16, 64, 256, 1024))
 
     def _rays(self) -> Technique:
-        return self._by_samples("rays", "rays", (4, 16, 64, 256, 1024))
+        return self._by_samples("rays", "rays", (2, 4, 16, 64, 256, 1024))
 
     def _adaptive(self) -> Technique:
         return self._by_samples("adaptive", "adaptive", (16, 64, 256))
