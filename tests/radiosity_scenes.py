@@ -33,6 +33,8 @@ def each_truth(prefix: str, key: str = ""):
     found = [
         name for name, case in truths().items() if name.startswith(prefix) and (not key or key in case["geometry"])
     ]
+    if not found and truths():
+        raise ValueError(f"no shared truth begins with {prefix!r} and has {key!r}: the test would test nothing")
     if not found:
         reason = f"the shared truths are not beside this checkout ({TRUTH})"
         return pytest.mark.parametrize("name", [pytest.param(prefix, marks=pytest.mark.skip(reason=reason))])
