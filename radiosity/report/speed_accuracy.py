@@ -7,10 +7,12 @@ after an interruption and takes up new techniques and settings at their own cost
 from __future__ import annotations
 
 import csv
+import gc
 import hashlib
 import io
 import itertools
 import math
+import random
 import resource
 import statistics
 import time
@@ -31,8 +33,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "COUNTS", "Comparison", "Point", "Run", "auto_ratios", "compare", "counted", "draw_chart", "measure", "points_of",
-    "read_runs", "scene_digest", "seconds_to", "write_runs",
+    "COUNTS", "Comparison", "Point", "Run", "apart", "auto_ratios", "compare", "counted", "draw_chart", "measure",
+    "points_of", "ranking", "read_runs", "scene_digest", "seconds_to", "write_runs",
 ]  # fmt: skip
 
 COUNTS = (
@@ -42,6 +44,12 @@ COUNTS = (
 """Counts of work that a record keeps; ``tests`` are all tests of rays against polygons, boxes and spheres."""
 ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 """Errors to which :func:`seconds_to` tells the seconds."""
+SHORT = 0.05
+"""A run of fewer seconds is short: its seconds are those of :data:`MORE` times as many runs."""
+MORE = 5
+SAME = 1.05
+"""Medians that differ by less are the same: where things lie in memory moves the seconds of a process by so much
+(T. Mytkowicz, A. Diwan, M. Hauswirth, P. F. Sweeney 2009), which no repeat within the process shows."""
 _TESTS = ("polygon_tests", "box_tests", "bounding_sphere_tests", "sphere_tests")
 
 
@@ -104,8 +112,9 @@ class Run:
 class Point:
     """All runs of one technique at one setting, summed up.
 
-    ``seconds`` is the median, ``quick`` and ``slow`` the fastest and the slowest run; ``error`` the
-    root mean square over the seeds, ``doubt`` its standard error.
+    ``seconds`` is the median, ``quick`` and ``slow`` its spread: the fastest and the slowest run, of eight
+    runs and more without the outermost eighth at each end.  ``error`` is the root mean square over the
+    seeds, ``doubt`` its standard error.
     """
 
     method: str
@@ -230,6 +239,7 @@ def measure(
     seeds: Sequence[int] = (0,),
     repeats: int = 3,
     limit: float = math.inf,
+    longest: float | None = None,
     before: Iterable[Run] = (),
     save: Callable[[list[Run]], None] = lambda runs: None,
     report: Callable[[str], None] = lambda line: None,
@@ -237,8 +247,11 @@ def measure(
     """Run techniques over their settings, interleaved.
 
     Every technique runs its coarsest setting once in vain first: kernels are compiled and loaded
-    then.  In each round all settings of all techniques run one after the other, every other round
-    backwards, so that a machine that slows down slows all alike.
+    then.  In each round all settings of all techniques run one after the other, from the second round
+    on in an order of chance (the same each time), so that a machine that slows down slows all alike and
+    none always follows the same other.  Settings whose runs are short go on for :data:`MORE` times as many
+    rounds: their spread is that of the machine's interruptions.  Garbage is collected before each run
+    and not during it.
 
     Parameters
     ----------
@@ -249,9 +262,12 @@ def measure(
     seeds : sequence of int
         A technique without chance runs with the first only.
     repeats : int
-        Rounds with each seed.
+        Rounds with each seed; of 1, short runs have one, too.
     limit : float
-        After a setting whose first run took longer, finer settings of the technique are left out. [s]
+        A setting whose first run took longer is not repeated. [s]
+    longest : float, optional
+        After a setting whose first run took longer, finer settings of the technique are left out; ``limit``
+        by default. [s]
     before : iterable of Run
         Runs of an old record.
     save : callable
@@ -295,41 +311,66 @@ def measure(
         tasks += [(name, value) for value in values]
     finest: dict[str, int] = {}
     order = {name: [value for n, value in tasks if n == name] for name in made}
-    rounds = [(seed, repeat) for repeat in range(repeats) for seed in seeds]
+    longest = limit if longest is None else max(limit, longest)
+
+    def run(place: tuple[str, float, int, int]) -> bool:
+        """Run it unless its record is known; whether it could."""
+        if place in known:
+            return True
+        name, value, seed, repeat = place
+        technique, prepare = made[name]
+        try:
+            gc.collect()
+            gc.disable()
+            with _Memory() as memory:
+                used, start = _processor_seconds(), time.perf_counter()
+                answer = technique.ask(value, seed)
+                seconds, used = time.perf_counter() - start, _processor_seconds() - used
+            error, doubt = relative_rms(problem.judged(answer.values), judge, variance)
+        except WorkbenchError as problem_found:
+            notes.append(f"{name} at {technique.key} {value:g} is left out: {problem_found}")
+            report(notes[-1])
+            finest[name] = order[name].index(value) - 1
+            return False
+        finally:
+            gc.enable()
+        told = answer.stated() if callable(answer.stated) else answer.stated
+        stated = math.nan if told is None else told
+        known[place] = Run(
+            name, technique.kind, technique.key, float(value), seed, repeat, seconds, used, prepare,
+            memory.used, error, doubt, stated, **counted(answer.counters),
+        )  # fmt: skip
+        report(f"{name:20s} {technique.key} {value:<8g} seed {seed}: {seconds:8.3f} s, error {error:.2e}")
+        save(list(known.values()))
+        return True
+
+    gc.collect()
+    gc.freeze()  # what is there now stays: collecting before each run is quick then
+    first = (seeds[0], 0)
+    rounds = [(seed, repeat) for repeat in range(repeats * MORE if repeats > 1 else 1) for seed in seeds]
     for number, (seed, repeat) in enumerate(rounds):
-        for name, value in tasks[:: 1 if number % 2 == 0 else -1]:
-            technique, prepare = made[name]
+        # Coarse to fine where settings may turn out too dear, then mixed.
+        for name, value in tasks if number == 0 else random.Random(number).sample(tasks, len(tasks)):
+            technique, _ = made[name]
             if (not technique.seeded and seed != seeds[0]) or order[name].index(value) > finest.get(name, 1 << 30):
                 continue
-            place = (name, value, seed, repeat)
-            if place not in known:
-                try:
-                    with _Memory() as memory:
-                        used, start = _processor_seconds(), time.perf_counter()
-                        answer = technique.ask(value, seed)
-                        seconds, used = time.perf_counter() - start, _processor_seconds() - used
-                    error, doubt = relative_rms(problem.judged(answer.values), judge, variance)
-                except WorkbenchError as problem_found:
-                    notes.append(f"{name} at {technique.key} {value:g} is left out: {problem_found}")
-                    report(notes[-1])
-                    finest[name] = order[name].index(value) - 1
+            known_first = known.get((name, value, *first))
+            if known_first is not None and (seed, repeat) != first:
+                if known_first.seconds > limit and longest > limit:
                     continue
-                told = answer.stated() if callable(answer.stated) else answer.stated
-                stated = math.nan if told is None else told
-                known[place] = Run(
-                    name, technique.kind, technique.key, float(value), seed, repeat, seconds, used, prepare,
-                    memory.used, error, doubt, stated, **counted(answer.counters),
-                )  # fmt: skip
-                report(f"{name:20s} {technique.key} {value:<8g} seed {seed}: {seconds:8.3f} s, error {error:.2e}")
-                save(list(known.values()))
-            if number == 0 and known[place].seconds > limit and name not in finest and order[name][-1] != value:
+                if repeat >= repeats and known_first.seconds >= SHORT:
+                    continue
+            if not run((name, value, seed, repeat)):
+                continue
+            if number == 0 and known[name, value, *first].seconds > longest and order[name][-1] != value:
                 finest[name] = order[name].index(value)
                 left = order[name][finest[name] + 1 :]
                 notes.append(
                     f"{name}: {technique.key} {', '.join(f'{v:g}' for v in left)} left out, since {value:g} took longer"
-                    f" than {limit:g} s (--limit)"
+                    f" than {longest:g} s"
                 )
                 report(notes[-1])
+    gc.unfreeze()
     runs = list(known.values())
     runs.sort(key=lambda run: (list(dict.fromkeys(r.method for r in known.values())).index(run.method), *run.place[1:]))
     return runs, notes
@@ -345,7 +386,8 @@ def points_of(runs: Sequence[Run]) -> list[Point]:
         groups.setdefault((run.method, run.value), []).append(run)
     points = []
     for (method, value), mine in groups.items():
-        seconds = [run.seconds for run in mine]
+        seconds = sorted(run.seconds for run in mine)
+        outer = len(seconds) // 8
         by_seed = {run.seed: run for run in mine}
         squares = [run.error**2 for run in by_seed.values()]
         error = math.sqrt(statistics.fmean(squares))
@@ -362,8 +404,8 @@ def points_of(runs: Sequence[Run]) -> list[Point]:
                 first.key,
                 value,
                 statistics.median(seconds),
-                min(seconds),
-                max(seconds),
+                seconds[outer],
+                seconds[-1 - outer],
                 statistics.median(run.cpu_seconds for run in mine),
                 max(run.memory_MB for run in mine),
                 # Less than its own doubt is not known of an error, when a reference has noise to take off.
@@ -414,6 +456,28 @@ def seconds_to(points: Sequence[Point], errors: Sequence[float] = ERRORS) -> lis
     return rows
 
 
+def apart(a: Point, b: Point) -> bool:
+    """Whether one of the two is faster beyond doubt: their spreads do not overlap, nor are their medians the same."""
+    if a.seconds > b.seconds:
+        a, b = b, a
+    return a.slow < b.quick and a.seconds * SAME < b.seconds
+
+
+def ranking(points: Sequence[Point]) -> list[tuple[Point, list[Point]]]:
+    """What nothing beats beyond the spread of the seconds, from fast to exact.
+
+    A point is beaten where another makes no larger error and is faster beyond doubt (:func:`apart`).
+
+    Returns
+    -------
+    list of (Point, list of Point)
+        Each point with those of the list that it is tied with: nothing can be said of their order.
+    """
+    kept = [p for p in points if not any(q.error <= p.error and q.seconds < p.seconds and apart(p, q) for q in points)]
+    kept.sort(key=lambda p: (p.seconds, p.error))
+    return [(p, [q for q in kept if q is not p and not apart(p, q)]) for p in kept]
+
+
 @dataclass(frozen=True)
 class Comparison:
     """Two records of the same question, from :func:`compare`.
@@ -427,7 +491,7 @@ class Comparison:
     frontier : int
         Settings on the frontier of either record that both have.
     swapped, ties : list of str
-        Pairs of them that stand in another order of seconds: outside their spread in both records, and inside.
+        Pairs of them that stand in another order of seconds: apart in both records, and tied in one or both.
     """
 
     runs: int
@@ -441,8 +505,7 @@ class Comparison:
 def compare(before: Sequence[Run], after: Sequence[Run]) -> Comparison:
     """Whether a chart was reproduced: all counts and errors of our own, and the order of the frontier.
 
-    Two points are tied where the stretches from their fastest to their slowest run overlap in either
-    record: nothing can be said of their order then.
+    Two points that are tied in either record (not :func:`apart`) have no order that could change.
     """
     known = {run.place: run for run in before}
     both = [(known[run.place], run) for run in after if run.place in known]
@@ -469,8 +532,8 @@ def compare(before: Sequence[Run], after: Sequence[Run]) -> Comparison:
     ties: list[str] = []
     for a, b in itertools.combinations(chosen, 2):
         if (first[a].seconds - first[b].seconds) * (second[a].seconds - second[b].seconds) < 0:
-            apart = all(r[a].slow < r[b].quick or r[b].slow < r[a].quick for r in (first, second))
-            (swapped if apart else ties).append(f"{a[0]} {a[1]:g} and {b[0]} {b[1]:g}")
+            told = all(apart(record[a], record[b]) for record in (first, second))
+            (swapped if told else ties).append(f"{a[0]} {a[1]:g} and {b[0]} {b[1]:g}")
     return Comparison(len(both), counts, errors, len(chosen), swapped, ties)
 
 
@@ -487,8 +550,9 @@ def draw_chart(figure: Figure, points: Sequence[Point], *, title: str, label: st
     """Error against seconds on logarithmic axes, into an empty figure.
 
     Ours are drawn in full lines, rivals in dashed ones with open markers, automatic choices as
-    stars; the frontier of all is a broad grey line.  Bars reach from the fastest to the slowest run
-    and over one standard error.  Below ``floor``, the reference's own error, nothing can be told.
+    stars; the frontier of all is a broad grey line, and points that are tied with it (:func:`ranking`)
+    have a grey ring.  Bars reach over the spread of the runs and over one standard error.  Below
+    ``floor``, the reference's own error, nothing can be told.
     """
     figure.set_size_inches(9.5, 6.2)
     axes = figure.subplots()
@@ -507,6 +571,13 @@ def draw_chart(figure: Figure, points: Sequence[Point], *, title: str, label: st
         [shown[i].seconds for i in best], [height(shown[i]) for i in best], color="0.8", lw=9, zorder=1,
         solid_capstyle="round", solid_joinstyle="round", label="frontier: nothing is both faster and more exact",
     )  # fmt: skip
+    drawn = {id(shown[i]) for i in best}
+    tied = [p for p, _ in ranking(shown) if id(p) not in drawn]
+    if tied:
+        axes.plot(
+            [p.seconds for p in tied], [height(p) for p in tied], ls="", marker="o", ms=17, mfc="none", mec="0.75",
+            mew=2.5, zorder=1, label="as fast as the frontier, within the spread of the runs",
+        )  # fmt: skip
     for number, method in enumerate(dict.fromkeys(p.method for p in shown)):
         mine = [p for p in shown if p.method == method]
         steep = slope([p.seconds for p in mine], [p.error for p in mine])
@@ -552,7 +623,7 @@ def draw_chart(figure: Figure, points: Sequence[Point], *, title: str, label: st
             "no error at all", (1.0, zero), xycoords=("axes fraction", "data"), xytext=(-3, 4),
             textcoords="offset points", ha="right", fontsize=8, color="0.4",
         )  # fmt: skip
-    axes.set_xlabel("seconds, median (bars: fastest and slowest run)")
+    axes.set_xlabel("seconds, median (bars: spread of the runs)")
     axes.set_ylabel(label)
     axes.set_title(title, fontsize=11)
     axes.grid(alpha=0.25, which="major")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
 from dataclasses import replace
@@ -15,12 +16,16 @@ from matplotlib.figure import Figure
 from radiosity.report.metrics import at_error, frontier, relative_rms, slope
 from radiosity.report.page import html_page
 from radiosity.report.speed_accuracy import (
+    MORE,
+    SAME,
     Run,
+    apart,
     auto_ratios,
     compare,
     draw_chart,
     measure,
     points_of,
+    ranking,
     read_runs,
     scene_digest,
     seconds_to,
@@ -105,7 +110,7 @@ class Coin(Problem):
 def test_records_grow_and_are_not_run_again(tmp_path):
     coin, judge = Coin(), Reference("truth", np.ones((4, 1)))
     runs, notes = measure(coin, judge, [("halving", None)], seeds=(0, 1), repeats=2)
-    assert len(runs) == 12 and not notes
+    assert len(runs) == 3 * 2 * 2 * MORE and not notes  # settings, seeds, repeats of short runs
     assert {run.error for run in runs} == {1.0, 0.5, 0.25}
     path = tmp_path / "records.csv"
     write_runs(path, runs)
@@ -113,9 +118,9 @@ def test_records_grow_and_are_not_run_again(tmp_path):
     assert [run.place for run in again] == [run.place for run in runs]
     asked = len(coin.calls)
     more, _ = measure(coin, judge, [("halving", None), ("exact", [4.0])], seeds=(0, 1), repeats=2, before=again)
-    assert len(more) == 14
-    assert [call[0] for call in coin.calls[asked:]] == ["exact"] * 3  # one in vain, two repeats, one seed
-    assert [replace(a, seconds=0) for a in more[:12]] == [replace(a, seconds=0) for a in again]
+    assert len(more) == len(runs) + 2 * MORE
+    assert [call[0] for call in coin.calls[asked:]] == ["exact"] * (1 + 2 * MORE)  # one in vain, one seed
+    assert [replace(a, seconds=0) for a in more[: len(runs)]] == [replace(a, seconds=0) for a in again]
     # A record from the beginning has the same counts and errors.
     fresh, _ = measure(Coin(), judge, [("halving", None), ("exact", [4.0])], seeds=(0, 1), repeats=2)
     assert [(r.place, r.rays, r.error) for r in fresh] == [(r.place, r.rays, r.error) for r in more]
@@ -129,15 +134,39 @@ def test_what_fails_is_left_out_with_its_reason():
 
 def test_dear_settings_are_left_out():
     runs, notes = measure(Coin(), Reference("truth", np.ones((4, 1))), [("halving", None)], repeats=3, limit=0.0)
-    assert {run.value for run in runs} == {1.0} and len(runs) == 3
+    assert {run.value for run in runs} == {1.0} and len(runs) == 3 * MORE
     assert "4, 16 left out" in notes[0]
+
+
+def test_long_runs_come_once_and_short_ones_often(monkeypatch):
+    """Of a clock that says 0.01, 1, 3 and 30 s: fifteen runs, three, one, and one after which the rest is left out."""
+    coin, now = Coin(), [0.0]
+    took = {1.0: 0.01, 2.0: 1.0, 3.0: 3.0, 4.0: 30.0, 5.0: 60.0}
+    technique = coin.technique
+
+    def slow(name):
+        made = technique(name)
+
+        def ask(value, seed):
+            assert not gc.isenabled() or not now[0]  # it is on in the run in vain only
+            now[0] += took[value]
+            return made.ask(value, seed)
+
+        return replace(made, ask=ask)
+
+    monkeypatch.setattr(coin, "technique", slow)
+    monkeypatch.setattr("radiosity.report.speed_accuracy.time.perf_counter", lambda: now[0])
+    plan = [("halving", list(took))]
+    runs, notes = measure(coin, Reference("truth", np.ones((4, 1))), plan, repeats=3, limit=2.0, longest=20.0)
+    assert [(p.value, p.runs) for p in points_of(runs)] == [(1.0, 15), (2.0, 3), (3.0, 1), (4.0, 1)]
+    assert "5 left out" in notes[0] and gc.isenabled()
 
 
 def test_points_and_the_ratio_of_auto():
     runs, _ = measure(Coin(), Reference("truth", np.ones((4, 1))), [("halving", None), ("auto", [4.0])], seeds=(0, 1))
     runs = [replace(run, seconds=run.value * (3.0 if run.kind == "auto" else 1.0)) for run in runs]
     points = points_of(runs)
-    assert [(p.method, p.value, p.error, p.runs) for p in points][-1] == ("auto", 4.0, 0.5, 6)
+    assert [(p.method, p.value, p.error, p.runs) for p in points][-1] == ("auto", 4.0, 0.5, 6 * MORE)
     assert [ratio for _, ratio in auto_ratios(points)] == [pytest.approx(3.0)]
 
 
@@ -187,6 +216,61 @@ def test_compare_finds_changed_counts_and_swaps():
     assert len(changed.counts) == 4 and "rays 64 -> 65" in changed.counts[0]
     off = compare(record(), [replace(run, error=run.error * 1.001) for run in record()])
     assert len(off.errors) == 6  # a rival's errors are its own
+
+
+def times(method, value, error, *seconds):
+    return [made(method, value, s, error, repeat=r) for r, s in enumerate(seconds)]
+
+
+def test_order_is_told_up_to_the_spread():
+    """Spreads that overlap, or medians within 5 %, are ties; one outlier of fifteen runs moves nothing."""
+    [a, b, c, d, e] = points_of(
+        [*times("a", 1, 0.3, 1.0, 1.1, 1.3), *times("b", 1, 0.2, 1.2, 1.4, 1.5), *times("c", 1, 0.4, 1.6, 1.61, 1.62),
+         *times("d", 1, 0.1, 2.0, 2.01, 2.0), *times("e", 1, 0.05, 2.07, 2.08, 2.07)]
+    )  # fmt: skip
+    assert not apart(a, b) and not apart(b, a) and apart(a, c) and apart(c, b)
+    assert d.slow < e.quick and not apart(d, e)  # 3.5 % apart in every run, which another process may turn round
+    assert [(p.method, [q.method for q in tied]) for p, tied in ranking([a, b, c, d, e])] == [
+        ("a", ["b"]), ("b", ["a"]), ("d", ["e"]), ("e", ["d"]),
+    ]  # fmt: skip
+    # c makes a larger error than b and takes longer; were it as fast as b's slowest run, it would be tied.
+    near = points_of([*times("b", 1, 0.2, 1.2, 1.4, 1.5), *times("c", 1, 0.4, 1.45, 1.46, 1.48)])
+    assert [p.method for p, _ in ranking(near)] == ["b", "c"]
+    [many] = points_of(times("m", 1, 0.1, *(1.0 + 0.001 * k for k in range(14)), 9.0))
+    assert (many.quick, many.slow) == (1.001, 1.013)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.floats(0.01, 100), st.floats(1.0, 2.0), st.floats(1e-6, 1)), min_size=1, max_size=12))
+def test_ranking_holds_the_frontier_and_nothing_beaten(drawn):
+    points = points_of([r for i, (t, wide, e) in enumerate(drawn) for r in times(f"m{i}", 1, e, t / wide, t, t * wide)])
+    kept = ranking(points)
+    names = {p.method for p, _ in kept}
+    assert {points[i].method for i in frontier([p.seconds for p in points], [p.error for p in points])} <= names
+    for p in points:
+        beaten = any(q.error <= p.error and q.slow < p.quick and q.seconds * SAME < p.seconds for q in points)
+        assert beaten == (p.method not in names)
+    others = {q.method: tied for q, tied in kept}
+    assert all(p in others[q.method] for p, tied in kept for q in tied)
+
+
+def test_a_rerun_within_the_spread_is_reproduced():
+    """Two settings that take the same time, run twice: no order is told, whichever came first."""
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        records = []
+        for _ in range(2):
+            drift = rng.uniform(0.5, 2.0)  # a whole record may be slow
+            seconds = {n: drift * rng.uniform(0.98, 1.02) * (1 + 0.05 * rng.exponential(size=15)) for n in "abc"}
+            records.append([r for n, error in zip("abc", (0.3, 0.2, 0.1), strict=True)
+                            for r in times(n, 16, error, *seconds[n])])  # fmt: skip
+        assert not compare(*records).swapped
+    # Three that take 1, 2 and 4 times as long keep their order, and are told when they do not.
+    first = [r for k, n in enumerate("abc") for r in times(n, 16, 0.3 - 0.1 * k, *(2.0**k * (1 + 0.05 * seconds["a"])))]
+    turned = [replace(r, method={"a": "b", "b": "a"}.get(r.method, r.method)) for r in first]
+    turned = [replace(r, error={"a": 0.3, "b": 0.2, "c": 0.1}[r.method]) for r in turned]
+    assert not compare(first, first).swapped
+    assert compare(first, turned).swapped == ["a 16 and b 16"]
 
 
 def test_chart_draws_every_technique_and_zero_errors():
