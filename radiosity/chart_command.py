@@ -48,7 +48,7 @@ LIMIT = 5.0
     default=3,
     show_default=True,
     metavar="N",
-    help="Runs of each; five times as many where one takes less than 0.05 s.",
+    help="Runs of each; five times as many where one takes less than 0.1 s.",
 )
 @click.option("--seeds", type=click.IntRange(1, 1000), default=1, show_default=True, metavar="N", help="Seeds, from 0.")
 @click.option(

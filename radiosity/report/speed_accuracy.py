@@ -44,7 +44,7 @@ COUNTS = (
 """Counts of work that a record keeps; ``tests`` are all tests of rays against polygons, boxes and spheres."""
 ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 """Errors to which :func:`seconds_to` tells the seconds."""
-SHORT = 0.05
+SHORT = 0.1
 """A run of fewer seconds is short: its seconds are those of :data:`MORE` times as many runs."""
 MORE = 5
 SAME = 1.05
@@ -354,12 +354,11 @@ def measure(
             technique, _ = made[name]
             if (not technique.seeded and seed != seeds[0]) or order[name].index(value) > finest.get(name, 1 << 30):
                 continue
-            known_first = known.get((name, value, *first))
-            if known_first is not None and (seed, repeat) != first:
-                if known_first.seconds > limit and longest > limit:
-                    continue
-                if repeat >= repeats and known_first.seconds >= SHORT:
-                    continue
+            took = known[name, value, *first].seconds if number else 0.0
+            if took > limit and longest > limit:
+                continue
+            if repeat >= repeats and min(known[name, value, seed, r].seconds for r in range(repeats)) >= SHORT:
+                continue
             if not run((name, value, seed, repeat)):
                 continue
             if number == 0 and known[name, value, *first].seconds > longest and order[name][-1] != value:
@@ -489,7 +488,7 @@ class Comparison:
     counts, errors : list of str
         Those of our own whose counts, or whose error (by more than a millionth of itself), differ.
     frontier : int
-        Settings on the frontier of either record that both have.
+        Settings in the :func:`ranking` of either record that both have.
     swapped, ties : list of str
         Pairs of them that stand in another order of seconds: apart in both records, and tied in one or both.
     """
@@ -522,11 +521,8 @@ def compare(before: Sequence[Run], after: Sequence[Run]) -> Comparison:
             errors.append(f"{name}: {old.error:.3e} -> {new.error:.3e}")
     first, second = ({(p.method, p.value): p for p in points_of(runs)} for runs in (before, after))
     best: dict[tuple[str, float], None] = {}
-    for points in (list(first.values()), list(second.values())):
-        best |= dict.fromkeys(
-            (points[i].method, points[i].value)
-            for i in frontier([p.seconds for p in points], [p.error for p in points])
-        )
+    for record in (first, second):
+        best |= dict.fromkeys((p.method, p.value) for p, _ in ranking(list(record.values())))
     chosen = [place for place in best if place in first and place in second]
     swapped: list[str] = []
     ties: list[str] = []
