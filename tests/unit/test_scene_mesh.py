@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import json
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -153,13 +155,71 @@ def test_white_is_read_as_the_whitest_paint(tmp_path):
 
 
 def test_names_prefer_the_material_that_no_other_part_has(tmp_path):
-    face = "f 1 2 3\n"
     text = (
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\no chair\nusemtl wood\n" + face + "usemtl felt\n" + face
-        + "o desk\nusemtl wood\n" + face + "g top\nusemtl steel\n" + face
-    )  # fmt: skip
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\no chair\nusemtl wood\nf 1 2 3\nusemtl felt\nf 1 2 4\n"
+        "o desk\nusemtl wood\nf 1 3 4\ng top\nusemtl steel\nf 2 3 4\n"
+    )
     names = [surface.name for surface in read_mesh(obj(tmp_path, text)).surfaces]
     assert names == ["chair/wood", "felt", "desk", "steel"]
+
+
+def _room(tmp_path, text, mtl):
+    """Reflectance and emission of the first band by surface, and the notes."""
+    mesh = read_mesh(obj(tmp_path, text, mtl))
+    values = {s.name: (s.material.reflectance[0], s.material.emission[0]) for s in mesh.surfaces}
+    return values, mesh.notes
+
+
+ROOM = "usemtl wall\n" + cube_obj(inward=True) + "v .2 .2 .9\nv .8 .2 .9\nv .8 .8 .9\nusemtl lamp\nf 9 11 10\n"
+PAINT = "newmtl wall\nKd 0.7 0.7 0.7\nnewmtl lamp\nKd 0 0 0\nKe 9 9 9\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "mtl"),
+    [
+        (ROOM.replace("\n", "\r"), PAINT.replace("\n", "\r\n")),
+        (ROOM, "\ufeff" + PAINT),
+        (ROOM.replace("f 9 11 10", "f 9 \\\n11 10"), PAINT),
+        (ROOM.replace("usemtl wall", "usemtl wall # grey"), PAINT.replace("Kd 0.7 0.7 0.7", "Kd 0.7 0.7 0.7 # grey")),
+        (ROOM.replace("wall", "Wall #25"), PAINT.replace("wall", "Wall #25")),
+        (ROOM.replace(" ", "\t"), PAINT.replace(" ", "\t")),
+    ],
+    ids=["old Mac", "byte order mark", "continued line", "comments", "a name with #", "tabs"],
+)
+def test_what_exporters_write_reads_the_same(tmp_path, text, mtl):
+    values, notes = _room(tmp_path, text, mtl)
+    assert list(values.values()) == [(0.7, 0.0), (0.0, 9.0)]
+    assert notes == ()
+    file = tmp_path / "mesh.obj"
+    file.write_text("\ufeff" + file.read_text())
+    assert [s.material.emission[0] for s in read_mesh(file).surfaces] == [0.0, 9.0]
+
+
+@pytest.mark.parametrize("name", [r".\mesh.mtl", r"C:\Users\me\mesh.mtl", "mesh.mtl mesh.mtl"])
+def test_material_files_are_found_by_names_from_windows(tmp_path, name):
+    (tmp_path / "mesh.mtl").write_text(PAINT)
+    mesh = read_mesh(obj(tmp_path, f"mtllib {name}\n" + ROOM))
+    assert [s.material.reflectance[0] for s in mesh.surfaces] == [0.7, 0.0]
+
+
+def test_a_material_that_no_file_defines_is_a_note(tmp_path):
+    _, notes = _room(tmp_path, ROOM.replace("usemtl wall", "usemtl brick"), PAINT)
+    assert notes == ("materials that no file defines are grey, reflectance 0.5 (1)",)
+
+
+def test_transparency_and_glowing_textures_of_mtl(tmp_path):
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "red glow.png")
+    mtl = PAINT.replace("Ke 9 9 9", "Ke 9 9 9\nmap_Ke -s 1 1 1 -clamp on red glow.png") + "Tr 0.25\n"
+    lamp = read_mesh(obj(tmp_path, ROOM, mtl)).surfaces[1].material
+    assert lamp.emission.tolist() == [9.0, 0.0, 0.0]
+    assert lamp.transmittance.tolist() == [0.25] * 3
+
+
+def test_faces_that_repeat_those_of_another_surface_are_dropped(tmp_path):
+    # Two equal rooms in one place, as a copied object leaves them: each wall would be lit half and count twice.
+    mesh = read_mesh(obj(tmp_path, "o one\n" + cube_obj() + "o two\n" + cube_obj().replace("v 0", "v -0")))
+    assert [s.name for s in mesh.surfaces] == ["one"]
+    assert mesh.notes == ("faces that repeat another were dropped (6)",)
 
 
 def test_vertex_normals_split_vertices(tmp_path):
@@ -269,6 +329,119 @@ def test_a_sphere_is_the_same_from_each_format(tmp_path, kind):
     assert closed_scene_gaps([surface]) == 0
     assert volume(surface) == pytest.approx(ball.volume, rel=1e-5)
     assert surface.material.reflectance.tolist() == [0.5, 0.5, 0.5]
+
+
+def ply(kind, rings, points, extra=""):
+    """A PLY file with a colour beside each vertex and a number beside each face."""
+    order = ">" if "big" in kind else "<"
+    head = (
+        f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex {len(points)}\nproperty float x\nproperty float y\n"
+        f"property double z\nproperty uchar red\nelement face {len(rings)}\n"
+        "property list uchar int vertex_indices\nproperty short number\n" + extra + "end_header\n"
+    )
+    if kind == "ascii":
+        rows = [f"{x:g} {y:g} {z:g} 200" for x, y, z in points]
+        rows += [f"{len(ring)} {' '.join(map(str, ring))} 7" for ring in rings]
+        return head.encode() + "\n".join(rows).encode()
+    body = b"".join(struct.pack(order + "ffdB", *point, 200) for point in points)
+    return head.encode() + body + b"".join(struct.pack(f"{order}B{len(r)}ih", len(r), *r, 7) for r in rings)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_polygons_of_ply_files_stay_whole(tmp_path, kind):
+    # An L whose first corner does not see its last ones, so that a fan of triangles would have another area: 3.
+    points = [[2, 0, 0], [2, 1, 0], [1, 1, 0], [1, 2, 0], [0, 2, 0], [0, 0, 0], [3, 0, 0], [3, 1, 0]]
+    (tmp_path / "l.ply").write_bytes(ply(kind, [[0, 1, 2, 3, 4, 5], [0, 6, 7, 1], [0, 6, 7, 1]], points))
+    mesh = read_mesh(tmp_path / "l.ply")
+    assert sizes(mesh.surfaces[0]) == [6, 4]
+    assert area(mesh.surfaces[0]) == pytest.approx(4)
+    assert mesh.notes == ("faces that repeat another were dropped (1)",)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data: data[:-1], "cut short"),
+        (lambda data: data.replace(b"element vertex 3", b"element vertex 999999999999"), "cut short"),
+        (lambda data: data.replace(b"element vertex 3", b"element vertex -3"), "line 4: found 'element vertex -3'"),
+        (lambda data: data.replace(b"property float y", b"property half y"), "line 6: found 'property half y'"),
+        (lambda data: data.replace(b"float x", b"float w"), "found no vertices with x, y and z"),
+        (lambda data: data.replace(b"binary_little_endian", b"utf-8"), "line 2"),
+        (lambda data: data[:-6] + struct.pack("<ih", 9, 7), "face 0: found the vertex indices"),
+    ],
+    ids=["short", "far too short", "negative", "type", "no x", "format", "index"],
+)
+def test_faults_of_ply_files_say_what_is_wrong(tmp_path, change, words):
+    data = ply("binary_little_endian", [[0, 1, 2]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    (tmp_path / "bad.ply").write_bytes(change(data))
+    with pytest.raises(SceneError, match=words) as caught:
+        read_mesh(tmp_path / "bad.ply")
+    assert "\n" not in str(caught.value)
+
+
+def gltf_room(tmp_path, kind):
+    """A cube as glTF with a lamp of strength 20, a spot light and a camera under a turned and moved node."""
+    cube = trimesh.creation.box()
+    cube.visual = trimesh.visual.TextureVisuals(
+        material=trimesh.visual.material.PBRMaterial(name="glow", emissiveFactor=[1.0, 0.5, 0.0])
+    )
+    files = trimesh.Scene(cube).export(file_type="gltf")
+    table = json.loads(files.pop("model.gltf"))
+    table["extensionsUsed"] = ["KHR_lights_punctual", "KHR_materials_emissive_strength"]
+    table["materials"][0]["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": 20.0}}
+    kinds = [
+        {"type": "spot", "color": [1, 1, 0.5], "intensity": 8.0, "spot": {"outerConeAngle": math.pi / 6}},
+        {"type": "directional", "name": "sun", "intensity": 3.0},
+        {"type": "point"},
+    ]
+    table["extensions"] = {"KHR_lights_punctual": {"lights": kinds}}
+    table["cameras"] = [{"type": "perspective", "perspective": {"yfov": math.pi / 3, "aspectRatio": 2.0}}]
+    first = len(table["nodes"])
+    table["nodes"] += [
+        # A quarter turn about x takes -z, the way of lights and cameras, to +y; scale does not turn it.
+        {"name": "above", "rotation": [math.sqrt(0.5), 0, 0, math.sqrt(0.5)], "translation": [1, 2, 3],
+         "scale": [2, 2, 2], "children": [first + 1, first + 2, first + 3]},
+        {"name": "lamp", "translation": [0, 0, -1], "extensions": {"KHR_lights_punctual": {"light": 0}}},
+        {"extensions": {"KHR_lights_punctual": {"light": 1}}},
+        {"name": "eye", "camera": 0, "extensions": {"KHR_lights_punctual": {"light": 2}}},
+    ]  # fmt: skip
+    table["scenes"][0]["nodes"].append(first)
+    if kind == "gltf":
+        for name, data in files.items():
+            (tmp_path / name).write_bytes(data)
+        (tmp_path / "room.gltf").write_text(json.dumps(table))
+        return tmp_path / "room.gltf"
+    # A .glb has one buffer: the parts of the others go behind each other.
+    starts = np.cumsum([0, *(buffer["byteLength"] for buffer in table["buffers"])]).tolist()
+    rest = b"".join(files[buffer["uri"]] for buffer in table["buffers"])
+    for view in table["bufferViews"]:
+        view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]
+        view["buffer"] = 0
+    table["buffers"] = [{"byteLength": starts[-1]}]
+    text = json.dumps(table).encode()
+    text += b" " * (-len(text) % 4)
+    rest += bytes(-len(rest) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(rest), len(text), 0x4E4F534A)
+    (tmp_path / "room.glb").write_bytes(head + text + struct.pack("<I4s", len(rest), b"BIN\0") + rest)
+    return tmp_path / "room.glb"
+
+
+@pytest.mark.parametrize("kind", ["gltf", "glb"])
+def test_lights_cameras_and_strength_of_gltf(tmp_path, kind):
+    scene = load_scene(gltf_room(tmp_path, kind))
+    assert scene.surfaces[0].face_count == 12
+    assert scene.surfaces[0].material.emission.tolist() == [20.0, 10.0, 0.0]
+    spot, sun, point = scene.lights
+    assert (spot.name, spot.kind, spot.power.tolist()) == ("lamp", "spot", [8.0, 8.0, 4.0])
+    assert np.allclose(spot.position, [1, 4, 3]) and np.allclose(spot.direction, [0, 1, 0])
+    assert spot.cone_deg == pytest.approx(30)
+    assert (sun.name, sun.kind, sun.power.tolist()) == ("sun", "directional", [3.0] * 3)
+    assert (point.name, point.kind, point.power.tolist()) == ("eye", "point", [1.0] * 3)
+    assert np.allclose(point.position, [1, 2, 3])
+    camera = scene.cameras["eye"]
+    assert scene.camera is camera and (camera.width, camera.height) == (1024, 512)
+    assert camera.fov_deg == pytest.approx(60)
+    assert np.allclose(camera.look_at - camera.eye, [0, 2, 0]) and np.allclose(camera.up, [0, 0, 2])
 
 
 def test_normals_of_a_ply_file_are_kept(tmp_path):
@@ -398,10 +571,10 @@ def test_faults_of_obj_name_the_line(tmp_path, text, line, words):
         ("newmtl a\nKd 1.2 0 0\n", "material 'a': found reflectance [1.2, 0.0, 0.0], expected numbers from 0 to 1"),
         ("newmtl a\nKd -0.1 0 0\n", "expected numbers from 0 to 1"),
         ("newmtl a\nKe nan 0 0\n", "expected one or three finite numbers"),
-        ("newmtl a\nKe bright\n", "found ke ['bright'], expected one or three finite numbers"),
+        ("newmtl a\nKe bright\n", "found ke 'bright', expected one or three finite numbers"),
         ("newmtl a\nKe 1 2\n", "expected one or three finite numbers"),
         ("newmtl a\nKe -1 0 0\n", "expected numbers of 0 or more"),
-        ("newmtl a\nillum nan\n", "found illum ['nan']"),
+        ("newmtl a\nillum nan\n", "found illum 'nan'"),
         ("newmtl a\nd 2\n", "transmittance"),
     ],
 )

@@ -1,39 +1,41 @@
 """Mesh files: OBJ, PLY, STL, GLB and glTF; the door to trimesh.
 
-PLY, STL, GLB and glTF are read by trimesh, which gives triangles.  OBJ statements are read here:
-trimesh cuts quads and polygons into triangles, where radiosity patches want them whole, and takes
-the negative indices of a file whose groups follow each other for those of the first group.
-Materials of OBJ files (MTL) are still parsed by trimesh.
+STL, GLB and glTF are read by trimesh, which gives triangles.  OBJ, MTL and PLY statements are read here:
+trimesh cuts quads and polygons into triangles, where radiosity patches want them whole, takes
+the negative indices of a file whose groups follow each other for those of the first group, and passes over
+colours with a comment behind them.
 
 What becomes of a file:
 
 * **Surfaces.**  One for each group or object and material of an OBJ file, one for each mesh node
   (with its transform applied) of the others.  It is named after its material if no other surface
   has that material, else after its group, else after both.
-* **Faces.**  OBJ quads and polygons stay whole, concave ones too; those that are not planar are cut
-  into triangles.  Faces without area, and those that repeat another of their surface, are
-  dropped.  The notes count each.
+* **Faces.**  Quads and polygons of OBJ and PLY files stay whole, concave ones too; those that are not
+  planar are cut into triangles.  Faces without area, and those that repeat another, are dropped.  The notes count
+  each.
 * **Fronts.**  The winding is taken as it stands and surfaces are one-sided, whether they look
   outward (a solid) or inward (a room), unless the file says ``doubleSided``.  Where neighbours
   of a closed body contradict each other, the smaller part of its faces is turned; where those of
   an open sheet do, its surface becomes two-sided.  Both are noted.
 * **Materials.**  OBJ: ``Kd`` is the reflectance, ``Ke`` the emission [W/m2], ``Ks`` with ``Ns`` the
   specular reflectance (a mirror from ``illum 3`` on, none for 0 and 1), cut where the sum would
-  exceed 1; ``Tf`` with ``illum`` 4, 6, 7 or 9, else ``1 - d``, the transmittance; ``Ni`` the index of
+  exceed 1; ``Tf`` with ``illum`` 4, 6, 7 or 9, else ``1 - d`` (or ``Tr``), the transmittance; ``Ni`` the index of
   refraction.  glTF: the base colour (linear by that format's definition) is the reflectance, its
-  alpha with ``alphaMode BLEND`` the transmittance, the emissive factor the emission; metal and roughness
-  are not read.  A texture counts with its mean colour, decoded from sRGB; a missing one is left
-  out.  Surfaces without a material are grey, reflectance 0.5.  All have three bands.
+  alpha with ``alphaMode BLEND`` the transmittance, the emissive factor times its strength the emission; metal and
+  roughness are not read.  A texture of reflectance or emission counts with its mean colour, decoded from sRGB; a
+  missing one is left out.  Surfaces without a material are grey, reflectance 0.5.  All have three bands.
+* **Lights and cameras** of glTF files are read (candela and lux as W/sr and W/m2); other formats have none.
 """
 
 from __future__ import annotations
 
 import gzip
+import io
 import zlib
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -43,8 +45,10 @@ from scipy import sparse
 from workbench.errors import SceneError
 from workbench.geometry.flat import Geometry
 from workbench.geometry.polygons import PLANARITY, triangulate_ring
+from workbench.scene._gltf import described, lights_and_cameras, strengthened
+from workbench.scene._ply import read_ply
 from workbench.scene.library import rings_cross
-from workbench.scene.model import Light, Material, Scene, Surface
+from workbench.scene.model import Camera, Light, Material, Scene, Surface
 
 __all__ = ["MESH_SUFFIXES", "MeshSurfaces", "lit", "load_scene", "read_mesh"]
 
@@ -66,10 +70,15 @@ _ZERO_AREA = 1e-14
 
 @dataclass(frozen=True)
 class MeshSurfaces:
-    """Surfaces of a mesh file, with three-band materials, and notes on what the reader changed."""
+    """Surfaces of a mesh file, with three-band materials, and notes on what the reader changed.
+
+    ``lights`` and ``cameras`` are those of a glTF file.
+    """
 
     surfaces: tuple[Surface, ...]
     notes: tuple[str, ...]
+    lights: tuple[Light, ...] = ()
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
 
 
 @dataclass
@@ -136,6 +145,49 @@ def _checked(material: Material, path: Path, notes: Counter[str]) -> Material:
 # OBJ
 
 
+def _decoded(data: bytes) -> str:
+    """Text of an OBJ or MTL file."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")  # names and comments of old exporters; numbers are the same
+
+
+def _statements(text: str) -> Iterator[tuple[int, str, str]]:
+    """Line number, keyword and the rest of each statement; a backslash at the end joins the next line."""
+    joined, start = "", 0
+    for number, line in enumerate([*text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), ""], start=1):
+        start = start or number
+        if line.endswith("\\"):
+            joined += line[:-1] + " "
+            continue
+        key, _, rest = (joined + line).strip().replace("\t", " ").partition(" ")
+        if key and not key.startswith("#"):
+            yield start, key, rest.strip()
+        joined, start = "", 0
+
+
+def _numbers_of(rest: str) -> list[str]:
+    """The words of a statement without its comment.  Names keep theirs: "Material #25" is one."""
+    return rest.split("#", 1)[0].split()
+
+
+def _named(name: str, materials: dict[str, Material]) -> str:
+    """The material that a ``usemtl`` means, which may have a comment behind it."""
+    return name if name in materials else name.split(" #", 1)[0].strip()
+
+
+def _beside(path: Path, name: str) -> Path | None:
+    """The file that another names: as it stands, with Windows' separators, or by its last part alone."""
+    for candidate in (name, name.replace("\\", "/"), PureWindowsPath(name).name):
+        try:
+            if (path.parent / candidate).is_file():
+                return path.parent / candidate
+        except (OSError, ValueError):  # too long, or a NUL
+            continue
+    return None
+
+
 def _read_obj(path: Path) -> tuple[list[_Part], dict[str, Material], Counter[str]]:
     """Statements ``v``, ``vn``, ``f``, ``g``, ``o``, ``usemtl`` and ``mtllib``; others are passed over."""
     data = _bytes_of(path)
@@ -146,42 +198,40 @@ def _read_obj(path: Path) -> tuple[list[_Part], dict[str, Material], Counter[str
             raise SceneError(f"found no gzip data ({error}), expected a compressed OBJ file", path=path) from None
     if b"\0" in data:
         raise SceneError("found binary data, expected the text of an OBJ file; check the file", path=path)
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")  # names and comments of old exporters; numbers are the same
 
     points: list[list[float]] = []
     normals: list[list[float]] = []
     faces: dict[tuple[str, str], list[tuple[list[int], list[int]]]] = {}
     libraries: list[str] = []
     group = object_name = material = ""
-    for number, line in enumerate(text.split("\n"), start=1):
-        words = line.split("#", 1)[0].split()
-        if not words:
-            continue
-        key, rest = words[0], words[1:]
+    for number, key, rest in _statements(_decoded(data)):
         try:
             if key in ("v", "vn"):
-                values = [float(word) for word in rest[:3]]
+                words = _numbers_of(rest)
+                values = [float(word) for word in words[:3]]
                 if len(values) < 3 or not all(abs(value) < 1e60 for value in values):
-                    raise ValueError(f"{key} {' '.join(rest)[:60]!r}, expected three finite numbers")
+                    raise ValueError(f"{key} {' '.join(words)[:60]!r}, expected three finite numbers")
                 (points if key == "v" else normals).append(values)
             elif key == "f":
-                corners, shading = _obj_face(rest, len(points), len(normals))
+                corners, shading = _obj_face(_numbers_of(rest), len(points), len(normals))
                 faces.setdefault((group or object_name, material), []).append((corners, shading))
             elif key == "g":
-                group = " ".join(rest)
+                group = rest
             elif key == "o":
-                object_name, group = " ".join(rest), ""
+                object_name, group = rest, ""
             elif key == "usemtl":
-                material = " ".join(rest)
+                material = rest
             elif key == "mtllib":
-                libraries.append(" ".join(rest))
+                libraries.append(rest)
         except ValueError as error:
             raise SceneError(f"found {error}; correct the line", path=path, line=number) from None
     if not faces:
         raise SceneError("found no face, expected `v` and `f` statements of an OBJ file", path=path)
+
+    notes: Counter[str] = Counter()
+    materials: dict[str, Material] = {}
+    for library in libraries:
+        materials |= _read_mtl(path, library, notes)
 
     position = np.asarray(points, dtype=np.float64)
     shading_normals = np.asarray(normals, dtype=np.float64).reshape(-1, 3)
@@ -197,12 +247,7 @@ def _read_obj(path: Path) -> tuple[list[_Part], dict[str, Material], Counter[str
         else:
             used, rings = np.unique(corner, return_inverse=True)
             part_normals = None
-        parts.append(_Part(name, material, position[used], rings.ravel(), sizes, part_normals))
-
-    notes: Counter[str] = Counter()
-    materials: dict[str, Material] = {}
-    for library in libraries:
-        materials |= _read_mtl(path, library, notes)
+        parts.append(_Part(name, _named(material, materials), position[used], rings.ravel(), sizes, part_normals))
     return parts, materials, notes
 
 
@@ -231,53 +276,81 @@ def _obj_face(words: list[str], point_count: int, normal_count: int) -> tuple[li
 
 
 def _read_mtl(path: Path, name: str, notes: Counter[str]) -> dict[str, Material]:
-    """Materials of one MTL file; a missing file is a note, as the geometry is whole without it."""
-    import trimesh
-
-    try:
-        text = (path.parent / name).read_bytes().decode("utf-8", errors="replace")
-    except (OSError, ValueError):
+    """Materials of one ``mtllib``; a missing file is a note, as the geometry is whole without it."""
+    whole = _beside(path, name)
+    files = [whole] if whole is not None else [_beside(path, word) for word in name.split()]
+    if not files or None in files:
         notes[f"the material file {name!r} is missing: surfaces are grey, reflectance {DEFAULT_REFLECTANCE}"] += 1
-        return {}
-    try:
-        records = trimesh.exchange.obj.parse_mtl(text, resolver=trimesh.resolvers.FilePathResolver(str(path)))
-    except Exception as error:  # a parser of foreign text may fail in any way
-        raise SceneError(f"material file {name!r}: cannot be read ({_brief(error)})", path=path) from None
-    missing = text.lower().count("map_kd") - sum("image" in record for record in records.values())
-    if missing:
-        notes[_TEXTURE_ABSENT] += missing
+    records: dict[str, dict[str, str]] = {}
+    for file in files:
+        if file is None:
+            continue
+        try:
+            text = _decoded(file.read_bytes())
+        except OSError as error:
+            raise SceneError(f"material file {name!r}: cannot be read ({error.strerror})", path=path) from None
+        record: dict[str, str] = {}
+        for _, key, rest in _statements(text):
+            if key.lower() == "newmtl":
+                record = records[rest] = {}
+            else:
+                record[key.lower()] = rest
     return {key: _checked(_mtl_material(key, record, path, notes), path, notes) for key, record in records.items()}
 
 
-def _mtl_material(name: str, record: dict[str, Any], path: Path, notes: Counter[str]) -> Material:
-    """The workbench's material for one record of trimesh's MTL parser."""
+def _picture(path: Path, statement: str, notes: Counter[str]) -> FloatArray | None:
+    """Mean linear colour (3,) of the texture that a ``map_`` statement names behind its options."""
+    from PIL import Image
+
+    words = statement.split()
+    file = _beside(path, statement)
+    while file is None and statement.startswith("-") and len(words) > 1:
+        # Options such as `-s 1 1 1 -clamp on` stand before the name, which may have spaces.
+        words = words[1:]
+        file = _beside(path, " ".join(words))
+    try:
+        image = Image.open(file) if file is not None else None
+    except Exception:  # a decoder of foreign bytes may fail in any way
+        image = None
+    if image is None:
+        notes[_TEXTURE_ABSENT] += 1
+        return None
+    return _mean_colour(image, notes)
+
+
+def _mtl_material(name: str, record: dict[str, str], path: Path, notes: Counter[str]) -> Material:
+    """The workbench's material for the statements of one ``newmtl``, by their keywords in small letters."""
 
     def numbers(key: str, default: float) -> FloatArray:
-        value = record.get(key, default)
+        words = _numbers_of(record[key]) if key in record else [str(default)]
         try:
-            values = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), 3))
-            if not np.isfinite(values).all():
+            values = np.array([float(word) for word in words if word != "-halo"])
+            if len(values) not in (1, 3) or not np.isfinite(values).all():
                 raise ValueError
-            return values
-        except (TypeError, ValueError):
+            return np.array(np.broadcast_to(values, 3))
+        except ValueError:
             raise SceneError(
-                f"material {name!r}: found {key} {str(value)[:60]}, expected one or three finite numbers; "
+                f"material {name!r}: found {key} {' '.join(words)[:60]!r}, expected one or three finite numbers; "
                 "correct the file",
                 path=path,
             ) from None
 
     reflectance = numbers("kd", DEFAULT_REFLECTANCE)
-    colour = _mean_colour(record["image"], notes) if "image" in record else None
+    colour = _picture(path, record["map_kd"], notes) if "map_kd" in record else None
     if colour is not None:
         # Exporters write Kd 0 or none beside a texture that carries the whole colour.
         reflectance = reflectance * colour if "kd" in record and reflectance.any() else colour
+    emission = numbers("ke", 0.0)
+    glow = _picture(path, record["map_ke"], notes) if "map_ke" in record else None
+    if glow is not None:
+        emission = emission * glow if emission.any() else glow
     illumination = int(numbers("illum", 2.0)[0])
-    opaque = float(numbers("d", 1.0)[0])
+    opaque = float(numbers("d", 1.0)[0] if "d" in record else 1.0 - numbers("tr", 0.0)[0])
     glass = illumination in (4, 6, 7, 9) and "tf" in record
     return _material(
         name,
         reflectance * (1.0 if glass else opaque),
-        emission=numbers("ke", 0.0),
+        emission=emission,
         specular=numbers("ks", 0.0) if illumination >= 2 else 0.0,
         exponent=np.inf if illumination >= 3 else max(numbers("ns", 0.0)[0], 0.0),
         transmittance=numbers("tf", 0.0) if glass else 1.0 - opaque,
@@ -289,14 +362,41 @@ def _mtl_material(name: str, record: dict[str, Any], path: Path, notes: Counter[
 # Everything else
 
 
-def _read_by_trimesh(path: Path) -> tuple[list[_Part], dict[str, Material], Counter[str]]:
-    """Mesh nodes of a PLY, STL, GLB or glTF file."""
+def _read_ply(path: Path) -> list[_Part]:
+    """The one part of a PLY file."""
+    vertices, rings, normals = read_ply(path, _bytes_of(path))
+    if not rings:
+        raise SceneError("found no face, expected a PLY file with faces", path=path)
+    corners = np.concatenate(rings)
+    if not np.isfinite(vertices[corners]).all():
+        raise SceneError("found coordinates that are not finite; export it anew", path=path)
+    if normals is None:
+        corners, vertices = _joined(corners, vertices)
+    return [_Part("", "", vertices, corners, np.asarray([len(ring) for ring in rings]), normals)]
+
+
+def _joined(corners: IntArray, vertices: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Corners and vertices without repetition: STL and many PLY files repeat a vertex for each face."""
+    vertices, index = np.unique(vertices, axis=0, return_inverse=True)
+    return index.ravel()[corners], vertices
+
+
+def _read_by_trimesh(path: Path) -> tuple[list[_Part], dict[str, Material], Counter[str], MeshSurfaces]:
+    """Mesh nodes of an STL, GLB or glTF file; lights and cameras of the latter in a record without surfaces."""
     import trimesh
 
-    _bytes_of(path)
+    data = _bytes_of(path)
     kind = path.suffix.lower().lstrip(".")
+    extra = MeshSurfaces((), ())
     try:
-        loaded = trimesh.load_scene(str(path), file_type=kind, process=False)
+        if kind != "stl":
+            description = described(data)
+            extra = MeshSurfaces((), (), *lights_and_cameras(description))
+            data = strengthened(data, description)
+            resolver = trimesh.resolvers.FilePathResolver(str(path))
+            loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+        else:
+            loaded = trimesh.load_scene(str(path), file_type=kind, process=False)
         nodes = [(node, *loaded.graph[node]) for node in loaded.graph.nodes_geometry]
     except Exception as error:  # a parser of foreign bytes may fail in any way
         raise SceneError(
@@ -319,9 +419,7 @@ def _read_by_trimesh(path: Path) -> tuple[list[_Part], dict[str, Material], Coun
         # trimesh tells only here whether normals came with the file; asking for them computes some.
         normals = np.asarray(mesh.vertex_normals) if "vertex_normals" in mesh._cache.cache else None
         if normals is None:
-            # STL and many PLY files repeat a vertex for each face: radiosity wants them joined.
-            vertices, index = np.unique(vertices, axis=0, return_inverse=True)
-            faces = index.ravel()[faces]
+            faces, vertices = _joined(faces, vertices)
         linear = np.asarray(matrix, dtype=np.float64)[:3, :3]
         vertices = vertices @ linear.T + matrix[:3, 3]
         if np.linalg.det(linear) < 0:
@@ -338,8 +436,10 @@ def _read_by_trimesh(path: Path) -> tuple[list[_Part], dict[str, Material], Coun
                 materials[key] = _checked(_pbr_material(key, material, notes), path, notes)
         parts.append(_Part(str(node), key, vertices, faces.ravel(), np.full(len(faces), 3), normals))
     if not parts:
-        raise SceneError(f"found no triangle, expected a {kind.upper()} file with faces", path=path)
-    return parts, materials, notes
+        raise SceneError(
+            f"found no triangle, expected a whole {kind.upper()} file with faces; is it cut short?", path=path
+        )
+    return parts, materials, notes, extra
 
 
 def _pbr_material(name: str, material: Any, notes: Counter[str]) -> Material:
@@ -396,8 +496,11 @@ def _unique(name: str, taken: Any) -> str:
     return candidate
 
 
-def _clean(part: _Part, path: Path, notes: Counter[str]) -> _Part | None:
-    """Faces with area, planar ones whole, others as triangles; ``None`` if nothing is left."""
+def _clean(part: _Part, path: Path, notes: Counter[str], seen: set[bytes]) -> _Part | None:
+    """Faces with area, planar ones whole, others as triangles; ``None`` if nothing is left.
+
+    ``seen`` are the faces of the parts before it, which are not repeated.
+    """
     starts = np.cumsum(part.sizes) - part.sizes
     kept: list[tuple[int, IntArray]] = []
     for size in np.unique(part.sizes):
@@ -432,16 +535,16 @@ def _clean(part: _Part, path: Path, notes: Counter[str]) -> _Part | None:
     kept.sort(key=lambda item: item[0])
     _, weld = np.unique(part.vertices, axis=0, return_inverse=True)
     weld = weld.ravel()
-    rings, seen = [], set()
+    places = part.vertices + 0.0  # one zero: -0.0 has other bytes
+    rings = []
     for _, ring in kept:
-        corners = weld[ring].tolist()
-        at = corners.index(min(corners))
-        corners = (*corners[at:], *corners[:at])
-        if corners in seen:
+        # Rings that start elsewhere are the same; the order along each axis is that of the welded numbers.
+        same = places[np.roll(ring, -int(weld[ring].argmin()))].tobytes()
+        if same in seen:
             # Two equal faces would send and receive everything twice.
             notes["faces that repeat another were dropped"] += 1
         else:
-            seen.add(corners)
+            seen.add(same)
             rings.append(ring)
     if not rings:
         return None
@@ -520,16 +623,27 @@ def read_mesh(path: str | Path) -> MeshSurfaces:
     if not path.name.lower().endswith(MESH_SUFFIXES):
         raise SceneError(f"found an unknown kind of mesh, expected one of {', '.join(MESH_SUFFIXES)}", path=path)
     is_obj = path.name.lower().endswith((".obj", ".obj.gz"))
-    parts, materials, notes = _read_obj(path) if is_obj else _read_by_trimesh(path)
+    materials: dict[str, Material] = {}
+    notes: Counter[str] = Counter()
+    extra = MeshSurfaces((), ())
+    if is_obj:
+        parts, materials, notes = _read_obj(path)
+    elif path.suffix.lower() == ".ply":
+        parts = _read_ply(path)
+    else:
+        parts, materials, notes, extra = _read_by_trimesh(path)
     surfaces = []
+    seen: set[bytes] = set()
     stem = path.name.split(".", 1)[0] or "mesh"
     for part, name in zip(parts, _names(parts, stem), strict=True):
         if not (np.abs(part.vertices) < 1e60).all():
             raise SceneError(f"surface {name!r}: found coordinates beyond 1e60; rescale the file", path=path)
-        clean = _clean(part, path, notes)
+        clean = _clean(part, path, notes, seen)
         if clean is None:
             continue
         material = materials.get(part.material) or _material(part.material or "default")
+        if part.material and material.name not in materials and not any("is missing" in note for note in notes):
+            notes[f"materials that no file defines are grey, reflectance {DEFAULT_REFLECTANCE}"] += 1
         agreed, consistent = _agree(clean, name, notes)
         if not consistent and not material.two_sided:
             material = replace(material, two_sided=True)
@@ -553,7 +667,8 @@ def read_mesh(path: str | Path) -> MeshSurfaces:
         )
     if not surfaces:
         raise SceneError("found no face with an area, expected a mesh", path=path)
-    return MeshSurfaces(tuple(surfaces), tuple(f"{text} ({count})" for text, count in notes.items()))
+    told = tuple(f"{text} ({count})" for text, count in notes.items())
+    return replace(extra, surfaces=tuple(surfaces), notes=told)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -561,7 +676,7 @@ def read_mesh(path: str | Path) -> MeshSurfaces:
 
 
 def load_scene(path: str | Path) -> Scene:
-    """A mesh file as a scene of three bands, without a camera; :func:`lit` if nothing in it emits.
+    """A mesh file as a scene of three bands, with the cameras of a glTF file; :func:`lit` if nothing in it emits.
 
     Raises
     ------
@@ -573,6 +688,9 @@ def load_scene(path: str | Path) -> Scene:
     scene = Scene(
         name=path.name.split(".", 1)[0] or path.name,
         surfaces=mesh.surfaces,
+        lights=mesh.lights,
+        camera=next(iter(mesh.cameras.values()), None),
+        cameras=mesh.cameras,
         background=np.zeros(3),
         bands=3,
         path=path,
