@@ -192,6 +192,11 @@ def test_scene_for_the_renderers(tmp_path):
     assert scene.lights[0].kind == "point" and scene.background.tolist() == [0.1, 0.2, 0.3]
 
 
+def test_a_pane_of_radiosity_keeps_no_more_than_arrives(tmp_path):
+    path = write(tmp_path, VIEW + "f 1 .5 0 .8 .1 9 .5 1\ns 0 0 0 1\n")
+    np.testing.assert_allclose(load_scene(path).surfaces[0].material.transmittance, [0.2, 0.5, 0.5])
+
+
 def test_a_fill_brighter_than_white_is_an_error(tmp_path):
     path = write(tmp_path, VIEW + "f 2 1 1 .8 0 1 0 0\ns 0 0 0 1")
     with pytest.raises(SceneError, match=r"line 9: found colour \* Kd = 1.6"):

@@ -426,3 +426,15 @@ def test_what_radiosity_cannot_use_is_an_error(tmp_path):
     path.write_text("scale 1 1 -1 world")
     with pytest.raises(SceneError, match="mirrors"):
         load_scene(path)
+
+
+def test_a_pane_of_radiosity_keeps_no_more_than_arrives(tmp_path):
+    # The sum of the shares may exceed 1 in the ray caster's formula, where radiosity would make light from nothing.
+    path = tmp_path / "a.sc"
+    path.write_text("world\nmaterial pane { color 1 .5 0 kdr .8 ktr .5 }\nuse pane\n" + SQUARE)
+    pane = load_scene(path).surfaces[0].material
+    np.testing.assert_allclose(pane.transmittance, [0.2, 0.5, 0.5])
+
+
+def test_line_ends_of_old_macs(tmp_path):
+    assert same(read(tmp_path, "world # ends here\rsphere 0 0 0 1"), read(tmp_path, "world\nsphere 0 0 0 1")) is None

@@ -67,7 +67,7 @@ class Words:
         word = re.compile(pattern)
         self._words = [
             (match.group(), number)
-            for number, line in enumerate(text.split("\n"), start=1)
+            for number, line in enumerate(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), start=1)
             for match in word.finditer(line.split("#", 1)[0])
         ]
         self._next = 0

@@ -235,13 +235,14 @@ def _material(fill: NffFill, index: int, scene: NffScene, line: int) -> Material
                 path=scene.path,
                 line=line,
             )
+    reflectance = fill.color * fill.kd
     return Material(
         name=f"fill {index}",
-        reflectance=fill.color * fill.kd,
+        reflectance=reflectance,
         emission=np.zeros(3),
         specular=np.full(3, fill.ks),
         exponent=fill.shine,
-        transmittance=np.full(3, fill.t),
+        transmittance=np.minimum(fill.t, 1.0 - reflectance),
         # Opaque fills often give 0, which no ray ever meets.
         ior=fill.ior or 1.0,
         two_sided=fill.t > 0,
@@ -287,7 +288,7 @@ def load_scene(path: str | Path, *, facet_error: float = 0.02) -> Scene:
 
     Polygons of one fill make a surface, patches of one fill another with vertex normals; each
     sphere, cone or cylinder makes its own, tessellated, with the facet error stated.  Reflectance
-    is ``colour * Kd``, ``specular`` is ``Ks`` in every band.  A light becomes a point light of
+    is ``colour * Kd``, ``specular`` is ``Ks`` in every band, ``T`` the transmittance, cut where it and the reflectance exceed 1.  A light becomes a point light of
     radiant intensity ``colour`` [W/sr]; NFF says nothing of fall-off.  The hither plane is left out.
 
     Parameters

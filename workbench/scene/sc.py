@@ -530,7 +530,8 @@ def load_scene(path: str | Path | Iterable[str | Path], *, facet_error: float = 
 
     The polygons of one group and one material make a surface; each sphere makes one, tessellated
     with the exact sphere beside it.  Reflectance is ``color * kdr``, ``specular`` is ``ksr`` in
-    every band, ``emission`` is the emitted radiosity.  Surfaces are one-sided.  A light becomes a
+    every band, ``ktr`` the transmittance, cut where it and the reflectance exceed 1; ``emission`` is the
+    emitted radiosity.  Surfaces are one-sided.  A light becomes a
     point light of radiant intensity I_i [W/sr], which falls with the square of the distance where
     the ray caster's does not; the ambient radiance is left out, being what radiosity computes.
 
@@ -560,13 +561,14 @@ def load_scene(path: str | Path | Iterable[str | Path], *, facet_error: float = 
                         path=source.paths[-1],
                         line=primitive.line,
                     )
+            reflectance = said.color * said.kdr
             materials[index] = Material(
                 name=said.name,
-                reflectance=said.color * said.kdr,
+                reflectance=reflectance,
                 emission=said.emission,
                 specular=np.full(3, said.ksr),
                 exponent=said.e,
-                transmittance=np.full(3, said.ktr),
+                transmittance=np.minimum(said.ktr, 1.0 - reflectance),
                 ior=said.eta,
             )
         return materials[index]
