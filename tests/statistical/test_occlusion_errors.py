@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from instrument_scenes import UNIT_SQUARE_LIGHT, geometry_of
+from instrument_scenes import FAR, UNIT_SQUARE_LIGHT, geometry_of
 from scipy import stats
 
 from workbench.geometry.tessellation import sphere_mesh
 from workbench.shadow.lights import LinearLight, SphereLight
-from workbench.shadow.occlusion import AreaLight, Shader
+from workbench.shadow.occlusion import AreaLight, Shader, estimate
 
 UP = np.array([0.0, 0.0, 1.0])
 SQUARE = AreaLight(UNIT_SQUARE_LIGHT, np.ones(1))
@@ -137,3 +137,18 @@ def test_auto_states_the_error_that_it_makes():
         stated = np.sqrt(np.mean(found.standard_error**2))
         assert made <= error * exact.mean()
         assert 0.3 * stated < made < 1.2 * stated
+
+
+@pytest.mark.parametrize("method", ["rays", "rays+plane-vertex"])
+def test_few_rays_above_the_horizon_state_the_error_of_few(method):
+    # A wall of light of which a fiftieth is above the floor: one or two rays of 64 count, and a shade over the upper
+    # third of that hides more than half of the light.
+    wall = np.array([[1, -1, -1], [1, -1, 0.02], [1, 1, 0.02], [1, 1, -1.0]])
+    light = AreaLight(wall, np.ones(1))
+    shade = np.array([[0.5, -FAR, 0.02 / 3], [0.5, FAR, 0.02 / 3], [0.5, FAR, 0.5], [0.5, -FAR, 0.5]])
+    points = np.column_stack([np.zeros(200), np.linspace(-0.5, 0.5, 200), np.zeros(200)])
+    geometry = geometry_of([shade])
+    exact = estimate(points, [0, 0, 1.0], light, geometry, "exact", workers=1)
+    found = estimate(points, [0, 0, 1.0], light, geometry, method, samples=64, workers=1)
+    off = np.abs(found.irradiance - exact.irradiance) / found.standard_error
+    assert (off > 4).mean() < 0.01

@@ -288,8 +288,9 @@ def load_scene(path: str | Path, *, facet_error: float = 0.02) -> Scene:
 
     Polygons of one fill make a surface, patches of one fill another with vertex normals; each
     sphere, cone or cylinder makes its own, tessellated, with the facet error stated.  Reflectance
-    is ``colour * Kd``, ``specular`` is ``Ks`` in every band, ``T`` the transmittance, cut where it and the reflectance exceed 1.  A light becomes a point light of
-    radiant intensity ``colour`` [W/sr]; NFF says nothing of fall-off.  The hither plane is left out.
+    is ``colour * Kd``, ``specular`` is ``Ks`` in every band, ``T`` the transmittance, cut where it and
+    the reflectance exceed 1.  A light becomes a point light of radiant intensity ``colour`` [W/sr]; NFF
+    says nothing of fall-off.  The hither plane is left out.
 
     Parameters
     ----------

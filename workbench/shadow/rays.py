@@ -141,7 +141,8 @@ def weighted_shares(first, last, count, weights, through, share, doubt):
     ``through`` is 0 where a ray is blocked and 1 (Embree: -1) where it arrives, or what a pane lets
     pass.  The error is pooled: the spread of four runs of the rays, which has three degrees of
     freedom and would by itself be far too small at some points, and what K points of the lattice
-    leave of a share on the average, :data:`NOISE` K^-3/4, less near 0 and 1.
+    leave of a share on the average, :data:`NOISE` K^-3/4, less near 0 and 1.  Rays of unequal weight, as to a
+    light that the horizon cuts, count as fewer: (sum w)^2 / sum w^2 (L. Kish, Survey Sampling, 1965).
     """
     row = 0
     runs = 4 if count >= 8 else 1
@@ -149,10 +150,12 @@ def weighted_shares(first, last, count, weights, through, share, doubt):
     for i in range(first, last):
         for run in range(runs):
             seen[run] = total[run] = 0.0
+        squares = 0.0
         for k in range(count):
             run = k * runs // count
             w = weights[row]
             total[run] += w
+            squares += w * w
             seen[run] += w * abs(through[row])
             row += 1
         whole = total[:runs].sum()
@@ -161,8 +164,9 @@ def weighted_shares(first, last, count, weights, through, share, doubt):
             continue
         mean = seen[:runs].sum() / whole
         share[i] = mean
+        rays = whole * whole / squares if squares > 0.0 else 1.0
         # A narrow shadow has nearly as long an outline as a wide one: the root of mean (1 - mean).
-        square = NOISE * NOISE * count**-1.5 * 2.0 * math.sqrt(max(mean * (1.0 - mean), 0.0))
+        square = NOISE * NOISE * rays**-1.5 * 2.0 * math.sqrt(max(mean * (1.0 - mean), 0.0))
         if runs > 1:
             spread = 0.0
             for run in range(runs):
@@ -170,7 +174,7 @@ def weighted_shares(first, last, count, weights, through, share, doubt):
             spread *= runs / (runs - 1.0) / (whole * whole)
             square = (PRIOR * square + (runs - 1.0) * spread) / (PRIOR + runs - 1.0)
         # K rays that agree leave room for a blocker, or a gap, of about half a ray's width.
-        doubt[i] = max(math.sqrt(square), 0.5 / count)
+        doubt[i] = max(math.sqrt(square), 0.5 / rays)
 
 
 def visible_shares(
