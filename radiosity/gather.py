@@ -20,7 +20,9 @@ import os
 import pickle
 import tempfile
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -30,15 +32,18 @@ from scipy.spatial import cKDTree
 from radiosity import _picture_kernels as kernels
 from radiosity.element_lookup import element_gradients
 from radiosity.regather import regathered
-from radiosity.sensors import Direct, Gatherer
+from radiosity.sensors import Direct, DirectLight, Gatherer, allotted
 from radiosity.solvers.solution import Solution
+from workbench.accel.base import NO_POLYGON
 from workbench.counters import Counters
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.memory import require_memory
+from workbench.render._trace_kernels import locate
 from workbench.render.camera import PinholeRays
-from workbench.render.trace import TraceOptions, Tracer
+from workbench.render.trace import TraceOptions, Tracer, corner_normals
 from workbench.sampling.sequences import sobol
+from workbench.scene.model import Scene
 
 __all__ = ["GatherOptions", "Picture", "PictureGatherer"]
 
@@ -52,9 +57,25 @@ NEIGHBOURS = 10
 APART = 1e6
 """Distance between sheets in the tree of nodes. [pixels]"""
 STEP = 0.1
-"""Relative step of direct light to a neighbouring pixel, or inside one, from which it is sampled inside."""
+"""Relative step of radiance inside a pixel from which it is sampled inside."""
+TURN = (0.02, 0.2)
+"""Relative second difference of direct light between pixels from which it is too: twice the error, within these."""
+TRUSTED = 0.05
+"""Error from which a pixel whose corners saw one polygon is taken to show it in its middle, without a ray."""
+FIRST_PLACES, MOST_PLACES = 8, 1024
+"""Rays from the eye in a pixel that shows an edge, before it is known how many it needs, and the most of them."""
+INSIDE_ERROR = 0.55
+"""Share of the error that edges in pixels may make."""
+NET_ERROR = 0.6
+"""n rays in a pixel leave this, times n^-3/4, of their standard deviation (measured)."""
+INSIDE_ROUNDS, GROWTH = 4, 8
+"""Rounds in which such rays are added, and how many times as many a pixel has after one."""
+CORNER_SHARE = 0.25
+"""A pixel's rays vary by this share of what its corners' radiance varies by, before they tell themselves."""
+POOL = 4.0
+"""Rays for which the mean spread of all pixels counts in that of one."""
 DIRECT_SHARE = 4
-"""Of so many rays in a subdivided pixel one is a place at which direct light is found."""
+"""Of so many rays in a subdivided pixel one is a place at which direct light is found; all where that has an edge."""
 SPACING = 0.5
 """Nodes stand no further apart than this share of the harmonic mean distance to what lights them."""
 PILOT_RAYS = (16, 128)
@@ -131,9 +152,9 @@ class GatherOptions:
         return int(np.clip(2 ** round(math.log2(16 * 0.02 / self.error)), 4, 64))
 
     @property
-    def subsamples(self) -> int:
-        """Rays from the eye in a pixel that shows an edge."""
-        return int(np.clip(2 ** round(math.log2(1.28 / self.error)), 16, 512))
+    def check_places(self) -> int:
+        """Rays from the eye in a pixel that is drawn again to tell the error."""
+        return int(np.clip(2 ** round(math.log2(2.56 / self.error)), 32, MOST_PLACES))
 
 
 @dataclass
@@ -158,6 +179,11 @@ class _Fragments:
     def __len__(self) -> int:
         return len(self.pixel)
 
+    @classmethod
+    def none(cls, bands: int) -> _Fragments:
+        whole, nothing, places = np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3))
+        return cls(whole, whole, whole, nothing, nothing, places, places, nothing, np.empty((0, bands)))
+
     def take(self, rows: NDArray) -> _Fragments:
         return _Fragments(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
@@ -170,71 +196,134 @@ class _Fragments:
 @dataclass
 class _Seen:
     """What rays from the eye met: radiance (n, bands) that needs no gather and the part of it without fuzzy
-    reflections, a mark (n,) by which rays that saw the same sheets are alike, and fragments, of which ``ray`` tells
-    the ray."""
+    reflections, a mark (n,) by which rays that saw the same sheets are alike, fragments, of which ``ray`` tells
+    the ray, in the order of the rays, and each ray's ``polygon`` (n,) where it is known."""
 
     radiance: FloatArray
     steady: FloatArray
-    mark: NDArray[np.uint64]
+    mark: IntArray
     fragments: _Fragments
     ray: IntArray
+    polygon: IntArray
+
+
+@dataclass(frozen=True)
+class _Plain:
+    """A scene where no ray from the eye leads on, as kernels read it."""
+
+    triangles: FloatArray
+    first_triangle: IntArray
+    corner_normals: FloatArray
+    one_sided: NDArray[np.bool_]
+    both_sides: NDArray[np.bool_]
+    reflectance: FloatArray
+    emitted: FloatArray
+
+    @classmethod
+    def build(cls, scene: Scene, geometry: Geometry) -> _Plain:
+        triangles, piece = geometry.triangles
+        both = np.array([surface.material.two_sided for surface in scene.surfaces])
+        rows = [(surface.material.reflectance, surface.material.emission) for surface in scene.surfaces]
+        reflectance, emission = np.array(rows).transpose(1, 0, 2)
+        return cls(
+            triangles,
+            np.searchsorted(geometry.piece_polygon[piece], np.arange(geometry.polygon_count + 1)),
+            corner_normals(scene, geometry),
+            ~both[geometry.polygon_surface],
+            both,
+            np.ascontiguousarray(reflectance),
+            emission / math.pi,
+        )
 
 
 class PictureGatherer:
-    """A solution made ready to be drawn.
+    """A solution made ready to be drawn, or a scene's direct light alone.
 
     Parameters
     ----------
-    solution : Solution
-        With its scene, of 1 or 3 bands.
+    source : Solution or DirectLight
+        A solution with its scene, of 1 or 3 bands; from direct light alone there is no indirect light.  A
+        :class:`radiosity.sensors.Gatherer` is taken as it is.
     options : GatherOptions, optional
     workers : int, optional
-        Threads, all cores by default; the picture does not depend on it.
+        Threads, all cores by default; the picture does not depend on it.  Those of direct light that is given.
     seed : int
         Of the rays.
+
+    Raises
+    ------
+    OptionError
+        If indirect light or a sky is wanted without a solution.
     """
 
     def __init__(
         self,
-        solution: Solution,
+        source: Solution | DirectLight,
         options: GatherOptions | None = None,
         *,
         workers: int | None = None,
         seed: int = 0,
     ) -> None:
         self.options = options or GatherOptions()
-        self.gatherer = Gatherer(solution, workers=workers, seed=seed)
-        if self.options.indirect and self.options.passes:
+        self.gatherer: DirectLight
+        if isinstance(source, DirectLight):
+            self.gatherer = source
+        else:
+            self.gatherer = Gatherer(source, workers=workers, seed=seed)
+        if not isinstance(self.gatherer, Gatherer):
+            if self.options.indirect:
+                raise OptionError("indirect: found True without a solution, expected one; solve the scene first")
+            if self.gatherer.sky is not None:
+                raise OptionError("source: found a scene with a sky, expected a solution of it; solve it first")
+        elif self.options.indirect and self.options.passes:
             self.gatherer = regathered(
-                solution, passes=self.options.passes, error=self.options.error, gatherer=self.gatherer, seed=seed
-            )
-        self.scene, self.geometry = solution.scene, self.gatherer.geometry
+                self.gatherer.solution, passes=self.options.passes, error=self.options.error, gatherer=self.gatherer,
+                seed=seed,
+            )  # fmt: skip
+        self.scene, self.geometry = self.gatherer.scene, self.gatherer.geometry
         self.workers, self.seed = self.gatherer.workers, seed
-        self.bands = solution.mesh.bands
+        self.bands = self.scene.bands
         materials = [surface.material for surface in self.scene.surfaces]
         # With a last row for rays that met nothing.
         self._fuzzy = np.array([m.specular.any() and math.isfinite(m.exponent) for m in materials] + [False])
-        fuzzy = bool(self._fuzzy.any())
-        leads_on = any(m.specular.any() or m.transmittance.any() for m in materials)
-        self._tracer = Tracer(
-            self.scene,
-            TraceOptions(
-                depth=FUZZY_DEPTH if fuzzy else DEPTH if leads_on else 0,
-                bundle=self.options.fuzzy_rays if fuzzy else 1,
-                see_backs=self.options.see_backs,
-                seed=seed,
-            ),
-            workers=self.workers,
-        )
-        self.rays_each = self.options.fuzzy_rays if fuzzy else 1
-        self._first = self.gatherer.shader.tracer if leads_on else None
+        self._leads_on = any(m.specular.any() or m.transmittance.any() for m in materials)
+        self.rays_each = self.options.fuzzy_rays if self._fuzzy.any() else 1
         self._sheets = _sheets(self.geometry)
         self._known: dict[int, int] = {}
         self._slopes: FloatArray | None = None
-        self._places = sobol(self.options.subsamples, np.random.default_rng(seed))
+        self._places = sobol(MOST_PLACES, np.random.default_rng(seed))
+        self.ambient = self._ambient()
+
+    @cached_property
+    def _tracer(self) -> Tracer:
+        fuzzy = bool(self._fuzzy.any())
+        return Tracer(
+            self.scene,
+            TraceOptions(
+                depth=FUZZY_DEPTH if fuzzy else DEPTH if self._leads_on else 0,
+                bundle=self.rays_each,
+                see_backs=self.options.see_backs,
+                seed=self.seed,
+            ),
+            workers=self.workers,
+        )
+
+    @cached_property
+    def _plain(self) -> _Plain:
+        return _Plain.build(self.scene, self.geometry)
+
+    def _ambient(self) -> FloatArray:
+        """Mean indirect irradiance (bands,), about: all of it, less what emitters send. [W m-2]"""
+        if not (self.options.indirect and isinstance(self.gatherer, Gatherer)):
+            return np.zeros(self.bands)
+        solution = self.gatherer.solution
+        mesh = solution.mesh
+        share = mesh.element_area / mesh.element_area.sum()
+        return np.maximum(share @ (solution.element_irradiance - mesh.emission), 0.0)
 
     def _read(self, points: FloatArray, polygon: IntArray, front: NDArray[np.bool_]) -> FloatArray:
         """Irradiance (n, bands) of the solution at points of polygons. [W m-2]"""
+        assert isinstance(self.gatherer, Gatherer)
         solution, lookup = self.gatherer.solution, self.gatherer.lookup
         if self._slopes is None:
             self._slopes = element_gradients(solution.mesh, lookup, solution.element_irradiance)
@@ -256,8 +345,9 @@ class PictureGatherer:
         other = copy.copy(self)
         other.options = replace(self.options, error=CHECK_SHARE / NODE_ERROR * self.options.error, rays=None)
         other.seed = self.seed + 104_729
-        other.gatherer = self.gatherer.doubting()
-        other._places = sobol(2 * self.options.subsamples, np.random.default_rng(other.seed))
+        if isinstance(self.gatherer, Gatherer):
+            other.gatherer = self.gatherer.doubting()
+        other._places = sobol(MOST_PLACES, np.random.default_rng(other.seed))
         return other
 
     def draw(self, rays: PinholeRays) -> Picture:
@@ -267,26 +357,33 @@ class PictureGatherer:
             pass
         return picture
 
-    def look(self, rays: PinholeRays, x: FloatArray, y: FloatArray, pixel: IntArray, keys: IntArray) -> _Seen:
-        """Follow rays through places of the picture to the diffuse surfaces that they see."""
+    def look(
+        self, rays: PinholeRays, x: FloatArray, y: FloatArray, pixel: IntArray, keys: IntArray,
+        known: IntArray | None = None,
+    ) -> _Seen:  # fmt: skip
+        """Follow rays through places of the picture to the diffuse surfaces that they see.
+
+        ``known`` (n,) are polygons that the rays meet, -1 where that is not known; only where no ray leads on.
+        """
+        if not self._leads_on:
+            return self._look_plainly(rays, x, y, pixel, known)
         along = rays.directions(x, y)
         ends = self._tracer.trace_to_diffuse(rays.eye, along, keys=keys)
         radiance, steady = ends.radiance.copy(), ends.radiance
         gain = ends.throughput * ends.reflectance / math.pi
         keep = np.arange(len(ends.ray))
         sheet = 2 * self._sheets[ends.polygon] + ~ends.front
-        if self._first is not None:
-            met = self._first.closest_hit(rays.eye, along).polygon
-            mirror = np.where(met >= 0, self.geometry.polygon_surface[met], -1)[ends.ray]
-            read = (ends.depth > 0) & self._fuzzy[mirror]
-            if read.any() and self.options.indirect:
-                # Many rays of a lobe, each of little weight: they read the solution, as bundles do.
-                light = self._read(ends.points[read], ends.polygon[read], ends.front[read])
-                np.add.at(radiance, ends.ray[read], gain[read] * light)
-                keep = np.flatnonzero(~read)
-            # Behind a mirror: another sheet for each mirror and each number of reflections.
-            behind = np.where(ends.depth > 0, (mirror + 1) * (DEPTH + 1) + ends.depth, 0)
-            sheet = self._numbered(sheet + behind * (2 * int(self._sheets.max(initial=0)) + 2))
+        met = self.gatherer.shader.tracer.closest_hit(rays.eye, along).polygon
+        mirror = np.where(met >= 0, self.geometry.polygon_surface[met], -1)[ends.ray]
+        read = (ends.depth > 0) & self._fuzzy[mirror]
+        if read.any() and self.options.indirect:
+            # Many rays of a lobe, each of little weight: they read the solution, as bundles do.
+            light = self._read(ends.points[read], ends.polygon[read], ends.front[read])
+            np.add.at(radiance, ends.ray[read], gain[read] * light)
+            keep = np.flatnonzero(~read)
+        # Behind a mirror: another sheet for each mirror and each number of reflections.
+        behind = np.where(ends.depth > 0, (mirror + 1) * (DEPTH + 1) + ends.depth, 0)
+        sheet = self._numbered(sheet + behind * (2 * int(self._sheets.max(initial=0)) + 2))
         names = ("ray", "points", "normals", "facing", "surface", "polygon")
         ends = replace(ends, **{name: getattr(ends, name)[keep] for name in names})
         sheet, gain = sheet[keep], gain[keep]
@@ -302,7 +399,76 @@ class PictureGatherer:
         mark = np.zeros(len(x), dtype=np.uint64)
         code = (sheet * (len(self.scene.surfaces) + 1) + ends.surface + 1).astype(np.uint64)
         np.add.at(mark, ends.ray, code * np.uint64(0x9E3779B97F4A7C15) ^ (code >> np.uint64(7)))
-        return _Seen(radiance, steady, mark, fragments, ends.ray)
+        order = np.argsort(ends.ray, kind="stable")
+        return _Seen(
+            radiance, steady, mark.astype(np.int64), fragments.take(order), ends.ray[order],
+            np.full(len(x), NO_POLYGON, dtype=np.int64),
+        )  # fmt: skip
+
+    def _look_plainly(
+        self, rays: PinholeRays, x: FloatArray, y: FloatArray, pixel: IntArray, known: IntArray | None
+    ) -> _Seen:
+        """:meth:`look` where no ray leads on: nothing mirrors, nothing lets light through."""
+        plain, geometry, tracer = self._plain, self.geometry, self.gatherer.shader.tracer
+        n = len(x)
+        along, points, facing, shading = (np.empty((n, 3)) for _ in range(4))
+        t, front = np.full(n, np.inf), np.zeros(n, dtype=bool)
+        polygon = np.full(n, NO_POLYGON, dtype=np.int64) if known is None else known
+        view = (rays.eye, rays.corner, rays.right, rays.down)
+
+        def work(part: slice) -> None:
+            toward, mine = along[part], polygon[part]
+            starts, directions = np.empty(toward.shape, np.float32), np.empty(toward.shape, np.float32)
+            kernels.eye_rays(*view, x[part], y[part], *tracer.frame, toward, starts, directions)
+            wanted = np.flatnonzero(mine == NO_POLYGON)
+            if len(wanted) == len(mine):
+                mine[:] = tracer.nearest_raw(starts, directions)
+            elif len(wanted):
+                mine[wanted] = tracer.nearest_raw(starts[wanted], directions[wanted])
+            eyes = np.broadcast_to(rays.eye, toward.shape)
+            table = (plain.first_triangle, plain.triangles, plain.corner_normals)
+            spread = (t[part], points[part], facing[part], shading[part], front[part])
+
+            def find(rows: IntArray) -> None:
+                locate(rows, eyes, toward, mine, *table, False, tracer.offset, *spread)
+
+            met = np.flatnonzero(mine != NO_POLYGON)
+            find(met)
+            if not self.options.see_backs:
+                # On through the backs of one-sided surfaces, in steps that double: a ray that grazes a back
+                # must not meet it for ever.
+                step = tracer.offset
+                while len(met):
+                    met = met[np.isfinite(spread[0][met]) & ~spread[4][met] & plain.one_sided[mine[met]]]
+                    if not len(met):
+                        break
+                    gone = spread[0][met] + step
+                    step *= 2.0
+                    mine[met] = tracer.closest_hit(rays.eye + gone[:, None] * toward[met], toward[met]).polygon
+                    spread[0][met] = np.inf
+                    met = met[mine[met] != NO_POLYGON]
+                    find(met)
+
+        self.gatherer.in_blocks(work, n)
+        radiance, mark = np.zeros((n, self.bands)), np.empty(n, dtype=np.int64)
+        ray, sheet = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+        footprint, gain = np.empty(n), np.empty((n, self.bands))
+        many = kernels.plain_ends(
+            along, polygon, t, facing, front, geometry.polygon_surface, plain.both_sides, plain.reflectance,
+            plain.emitted, self.scene.background, self._sheets, float(np.linalg.norm(rays.right)), radiance, mark, ray,
+            sheet, footprint, gain,
+        )  # fmt: skip
+        if self.gatherer.sky is not None:
+            missed = np.flatnonzero(~np.isfinite(t))
+            if len(missed):
+                radiance[missed] = self.gatherer.sky.radiance(along[missed])
+        ray = ray[:many]
+        rows = ray if many < n else slice(None)
+        fragments = _Fragments(
+            pixel[rows], sheet[:many], polygon[rows], x[rows], y[rows], points[rows], shading[rows], footprint[:many],
+            gain[:many],
+        )  # fmt: skip
+        return _Seen(radiance, radiance, mark, fragments, ray, polygon)
 
 
 def _sheets(geometry: Geometry) -> IntArray:
@@ -403,7 +569,8 @@ class Picture:
     def steps(self) -> Iterator[float]:
         """Draw; yields after each tile how much is done, 0..1, and may be left at any time."""
         many = len(self.tiles)
-        with tempfile.TemporaryDirectory(prefix="radiosity-") as folder:
+        with ExitStack() as stack:
+            folder: str | None = None
             waiting: dict[int, Any] = {}
             for number in range(many):
                 if number in self.finished:
@@ -420,6 +587,7 @@ class Picture:
                     # Beyond a few tiles what they see is kept on disk: memory does not grow with the picture.
                     kept = tile.light
                     if len(waiting) >= TILES_IN_MEMORY:
+                        folder = folder or stack.enter_context(tempfile.TemporaryDirectory(prefix="radiosity-"))
                         path = os.path.join(folder, f"{number}.pickle")
                         with open(path, "wb") as file:
                             pickle.dump(kept, file)
@@ -562,35 +730,34 @@ class _Tile:
         self.pitch = int(np.clip(2 ** round(math.log2(max(min(self.rays.width, self.rays.height), 1) / 16)), 4, 64))
         self.counters = Counters()
         self.calls = 0
+        pixels = self.width * self.height
+        self.samples = {name: np.zeros(pixels, dtype=np.int64) for name in ("camera", "direct", "indirect")}
 
     def look(self) -> None:
         """Find what the pixels see, and its direct light."""
         shape = self.height * self.width
         radiance = np.zeros((shape, self.owner.bands))
-        self.samples = {name: np.zeros(shape, dtype=np.int64) for name in ("camera", "direct", "indirect")}
-        whole, edges = self._whole_pixels(radiance)
+        whole, edges, corners = self._whole_pixels(radiance)
         straight = self._direct(whole)
         direct = straight.irradiance
+        bent = np.unique(whole.pixel[self._bends(whole, direct)])
         cut = np.zeros(shape, dtype=bool)
-        cut[edges] = cut[whole.pixel[self._shadow_edges(whole, direct)]] = True
+        cut[edges] = cut[bent] = True
+        shadow = np.zeros(shape, dtype=bool)
+        shadow[bent] = True
         radiance[cut] = 0.0
         kept = ~cut[whole.pixel]
-        self.samples["camera"] += 2
+        self.samples["camera"] += 1  # a corner
         self.samples["direct"] += np.bincount(whole.pixel, minlength=shape)
         self.states = np.full((shape, len(self.owner.gatherer.lights)), -1, dtype=np.int8)
         self.states[whole.pixel] = straight.state
-        parts, light, crowded = [whole.take(kept)], [direct[kept]], [straight.crowded[kept]]
         inside = np.flatnonzero(cut)
-        step = max(1, RAYS_AT_ONCE // (self.options.subsamples * self.owner.rays_each))
-        for first in range(0, len(inside), step):
-            pixels = inside[first : first + step]
-            fragments, found, dim, places = self._divide(pixels, radiance)
-            self.samples["camera"][pixels] += self.options.subsamples
-            self.samples["direct"] += np.bincount(places, minlength=shape)
-            parts.append(fragments)
-            light.append(found)
-            crowded.append(dim)
-        self.light = _Light(radiance, _Fragments.joined(parts), np.concatenate(light), np.concatenate(crowded))
+        allowed = (INSIDE_ERROR * self.options.error) ** 2 * shape
+        fragments, light, crowded = self._divide(inside, shadow[inside], corners[inside], radiance, allowed)
+        self.light = _Light(
+            radiance, _Fragments.joined([whole.take(kept), fragments]), np.concatenate([direct[kept], light]),
+            np.concatenate([straight.crowded[kept], crowded]),
+        )  # fmt: skip
 
     def reflect(self, nodes: _Nodes) -> None:
         """Add what the fragments reflect, their indirect light read between nodes."""
@@ -613,7 +780,7 @@ class _Tile:
         """Radiance (n, bands) of some pixels without nodes, and its variance by bundles."""
         shape = self.height * self.width
         radiance = np.zeros((shape, self.owner.bands))
-        fragments, direct, crowded, _ = self._divide(pixels, radiance)
+        fragments, direct, crowded = self._divide(pixels, np.zeros(len(pixels), dtype=bool), 0.0, radiance, None)
         variance = np.zeros_like(radiance)
         arriving, bands = direct, self.owner.bands
         self.light = _Light(radiance, fragments, direct, crowded)
@@ -631,73 +798,138 @@ class _Tile:
 
     # ---- rays from the eye ----------------------------------------------------------------------
 
-    def _look(self, x: NDArray, y: NDArray, pixel: IntArray, keys: IntArray) -> _Seen:
+    def _look(self, x: NDArray, y: NDArray, pixel: IntArray, keys: IntArray, known: IntArray | None = None) -> _Seen:
         self.counters.add(rays=len(x), cast_rays=len(x))
-        return self.owner.look(self.rays, self.left + x, self.top + y, pixel, keys)
+        return self.owner.look(self.rays, self.left + x, self.top + y, pixel, keys, known)
 
-    def _whole_pixels(self, radiance: FloatArray) -> tuple[_Fragments, IntArray]:
-        """Fragments of the pixels whose middle and corners see the same, and the numbers of the others."""
-        number = np.arange(self.height * self.width)
-        row, column = np.divmod(number, self.width)
-        middle = self._look(column + 0.5, row + 0.5, number, self._keys(column, row, 0))
-        across, along = (v.ravel() for v in np.meshgrid(np.arange(self.width + 1), np.arange(self.height + 1)))
+    def _whole_pixels(self, radiance: FloatArray) -> tuple[_Fragments, IntArray, FloatArray]:
+        """Fragments of the pixels whose middle and corners see the same, in their order, the other pixels, and the
+        variance (pixels,) of what the corners see shine."""
+        shape = self.height * self.width
         # Corners stand off whole numbers by a hair: edges of rooms like to lie on them.
-        corner = self._look(across + 1e-4, along + 1e-4, np.arange(len(across)), self._keys(across, along, 0))
-        at = row * (self.width + 1) + column
-        same = np.ones(len(number), dtype=bool)
-        scale = middle.steady.max(axis=1)
-        for place in (at, at + 1, at + self.width + 1, at + self.width + 2):
-            other = corner.steady[place]
+        down, across = np.divmod(np.arange((self.width + 1) * (self.height + 1)), self.width + 1)
+        corner = self._look(across + 1e-4, down + 1e-4, np.arange(len(across)), self._keys(across, down, 0))
+        same, varies = np.empty(shape, dtype=bool), np.empty(shape)
+        kernels.alike(corner.mark, corner.steady, self.width, self.height, STEP, same, varies)
+        pixel = np.flatnonzero(same)
+        row, column = np.divmod(pixel, self.width)
+        first = row * (self.width + 1) + column
+        known = None
+        if self.options.error >= TRUSTED:
+            known = corner.polygon[first]
+            for other in (1, self.width + 1, self.width + 2):
+                known[corner.polygon[first + other] != known] = NO_POLYGON
+        self.samples["camera"][pixel] += 1 if known is None else known == NO_POLYGON
+        middle = self._look(column + 0.5, row + 0.5, pixel, self._keys(column, row, 0), known)
+        agree = middle.mark == corner.mark[first]
+        if corner.steady.any():
+            other = corner.steady[first]
             step = np.abs(other - middle.steady).max(axis=1)
-            same &= (corner.mark[place] == middle.mark) & (step <= STEP * np.maximum(scale, other.max(axis=1)))
-        radiance[same] = middle.radiance[same]
-        return middle.fragments.take(np.flatnonzero(same[middle.fragments.pixel])), np.flatnonzero(~same)
+            agree &= step <= STEP * np.maximum(other, middle.steady).max(axis=1)
+        if agree.all():
+            radiance[pixel] = middle.radiance
+            return middle.fragments, np.flatnonzero(~same), varies
+        same[pixel[~agree]] = False
+        radiance[pixel[agree]] = middle.radiance[agree]
+        return middle.fragments.take(np.flatnonzero(agree[middle.ray])), np.flatnonzero(~same), varies
 
     def _keys(self, column: IntArray, row: IntArray, place: int | IntArray) -> IntArray:
         """Number of a ray in the whole picture, which its random numbers come from."""
         return ((row + self.top) * (self.rays.width + 1) + column + self.left) * (1 << 10) + place
 
     def _divide(
-        self, pixels: IntArray, radiance: FloatArray
-    ) -> tuple[_Fragments, FloatArray, NDArray[np.bool_], IntArray]:
-        """Cast many rays in some pixels: fragments, their direct light, if crowded, and pixels of its places."""
-        many = len(self.owner._places)
-        row, column = np.divmod(np.repeat(pixels, many), self.width)
-        place = np.tile(np.arange(many), len(pixels))
+        self,
+        pixels: IntArray,
+        shadow: NDArray[np.bool_],
+        corners: FloatArray | float,
+        radiance: FloatArray,
+        allowed: float | None,
+    ) -> tuple[_Fragments, FloatArray, NDArray[np.bool_]]:
+        """Cast rays in some pixels until their squared relative errors add up to ``allowed``; if None, as a check does.
+
+        ``shadow`` tells where direct light has an edge, ``corners`` by what the corners' radiance varies.  Returns
+        fragments, their direct light, and if crowded.
+        """
+        bands, count = self.owner.bands, np.zeros(len(pixels), dtype=np.int64)
+        seen, moments = np.zeros((len(pixels), bands)), np.zeros((len(pixels), 5))
+        moments[:, 3], moments[:, 4] = math.inf, corners
+        parts: list[tuple[_Fragments, IntArray, FloatArray, NDArray[np.bool_]]] = []
+        target = np.full(len(pixels), FIRST_PLACES if allowed is not None else self.options.check_places)
+        for _ in range(INSIDE_ROUNDS if allowed is not None else 1):
+            self._cast(pixels, shadow, count, target, seen, moments, parts)
+            count = np.maximum(count, target)
+            if allowed is None or not len(pixels):
+                break
+            variance = _variances(moments)
+            if variance.sum() <= allowed:
+                break
+            # What the most rays leave has to be borne.
+            least = 1.5 * float((variance * (count / MOST_PLACES) ** 1.5).sum())
+            target = allotted(variance[:, None], count, np.array([max(allowed, least) / len(pixels)]), MOST_PLACES)
+            target = np.minimum(target, GROWTH * count)
+        radiance[pixels] = seen / np.maximum(count, 1)[:, None]
+        self.samples["camera"][pixels] += count
+        if not parts:
+            return _Fragments.none(bands), np.zeros((0, bands)), np.zeros(0, dtype=bool)
+        fragments = _Fragments.joined([part[0] for part in parts])
+        fragments.gain /= count[np.concatenate([part[1] for part in parts])][:, None]
+        return fragments, np.concatenate([part[2] for part in parts]), np.concatenate([part[3] for part in parts])
+
+    def _cast(
+        self, pixels: IntArray, shadow: NDArray[np.bool_], count: IntArray, target: IntArray, seen: FloatArray,
+        moments: FloatArray, parts: list[tuple[_Fragments, IntArray, FloatArray, NDArray[np.bool_]]],
+    ) -> None:  # fmt: skip
+        """Cast the rays that pixels with ``count`` of them lack to ``target``, and take their sums up."""
+        more = np.maximum(target - count, 0)
+        # The first rays tell what direct light varies by, too, if that matters.
+        share = 1 if self.options.error < TRUSTED and not count.any() else DIRECT_SHARE
+        ends = np.cumsum(more)
+        most = max(RAYS_AT_ONCE // self.owner.rays_each, MOST_PLACES)
+        first = 0
+        while first < len(pixels):
+            last = max(int(np.searchsorted(ends, ends[first] - more[first] + most, side="right")), first + 1)
+            rows = np.repeat(np.arange(first, last), more[first:last])
+            if len(rows):
+                before = ends[first] - more[first]
+                place = np.arange(len(rows)) - (ends - more - before - count)[rows]
+                # The first of each pixel's new places: together they are spread over it.
+                wanted = shadow[rows] | (share * (place - count[rows]) < more[rows])
+                self._cast_in(pixels, rows, place, wanted, seen, moments, parts)
+            first = last
+
+    def _cast_in(
+        self, pixels: IntArray, rows: IntArray, place: IntArray, wanted: NDArray[np.bool_], seen: FloatArray,
+        moments: FloatArray, parts: list[tuple[_Fragments, IntArray, FloatArray, NDArray[np.bool_]]],
+    ) -> None:  # fmt: skip
+        """Cast rays in pixels ``rows`` at places of the net; direct light is ``wanted`` at some."""
+        number = pixels[rows]
+        row, column = np.divmod(number, self.width)
         inside = self.owner._places[place]
-        seen = self._look(
-            column + inside[:, 0], row + inside[:, 1], np.repeat(pixels, many), self._keys(column, row, place)
-        )
-        radiance[pixels] = seen.radiance.reshape(len(pixels), many, -1).mean(axis=1)
-        every = seen.fragments
-        bands = self.owner.bands
-        if not len(every):
-            return every, np.zeros((0, bands)), np.zeros(0, dtype=bool), every.pixel
-        # What the rays of a pixel see of one sheet is one fragment.
-        order = np.lexsort((every.sheet, every.pixel))
-        changes = (np.diff(every.sheet[order]) != 0) | (np.diff(every.pixel[order]) != 0)
-        start = np.flatnonzero(np.concatenate([[True], changes]))
-        counts = np.diff(np.append(start, len(order)))
-        group = np.repeat(np.arange(len(start)), counts)
-        # The place nearest to the mean stands for all: the mean itself may lie under something.
-        middle_x, middle_y = (np.bincount(group, v[order]) / counts for v in (every.x, every.y))
-        off = np.hypot(every.x[order] - middle_x[group], every.y[order] - middle_y[group])
-        fragments = every.take(order[np.lexsort((off, group))[start]])
-        gain = every.gain[order]
-        fragments.gain = np.column_stack([np.bincount(group, band) / many for band in gain.T])
-        # Direct light at some places of each fragment, for shadows have edges inside pixels, too:
-        # weighted by gain, which differs where one sheet holds several surfaces.
-        chosen = seen.ray[order] % many < many // DIRECT_SHARE
-        had = np.bincount(group, chosen) > 0
-        chosen[start[~had]] = True
-        straight = self._direct(every.take(order[chosen]))
-        light = straight.irradiance
-        weight = gain[chosen]
-        total = np.column_stack([np.bincount(group[chosen], w, len(start)) for w in weight.T])
-        sums = np.column_stack([np.bincount(group[chosen], w, len(start)) for w in (weight * light).T])
-        direct = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
-        crowded = np.bincount(group[chosen], straight.crowded, len(start)) > 0
-        return fragments, direct, crowded, every.pixel[order[chosen]]
+        found = self._look(column + inside[:, 0], row + inside[:, 1], number, self._keys(column, row, place))
+        every, bands = found.fragments, self.owner.bands
+        bright = found.radiance.sum(axis=1)
+        if len(every):
+            # What the rays of a pixel see of one sheet is one fragment.
+            owner = rows[found.ray]
+            group, label = np.empty(len(every), dtype=np.int64), np.empty(len(every), dtype=np.int64)
+            many = kernels.group_sheets(owner, every.sheet, group, label)
+            total, chosen = np.empty((many, bands)), np.empty(many, dtype=np.int64)
+            asked = np.empty(len(every), dtype=bool)
+            kernels.stand_for(group, every.x, every.y, every.gain, wanted[found.ray], total, chosen, asked)
+            # Direct light at some places of each fragment, for shadows have edges inside pixels, too: weighted
+            # by gain, which differs where one sheet holds several surfaces.
+            places = np.flatnonzero(asked)
+            straight = self._direct(every.take(places))
+            light = np.empty((many, bands))
+            kernels.light_of_groups(
+                group, places, every.gain, straight.irradiance, found.ray, self.owner.ambient, light, bright
+            )
+            crowded = np.bincount(group[places], straight.crowded, many) > 0
+            fragments = every.take(chosen)
+            fragments.gain = total
+            parts.append((fragments, owner[chosen], light, crowded))
+            self.samples["direct"] += np.bincount(every.pixel[places], minlength=len(self.samples["direct"]))
+        kernels.sum_rays(rows, found.radiance, bright, seen, moments)
 
     # ---- direct light ---------------------------------------------------------------------------
 
@@ -707,21 +939,12 @@ class _Tile:
             counters=self.counters,
         )  # fmt: skip
 
-    def _shadow_edges(self, fragments: _Fragments, direct: FloatArray) -> NDArray[np.bool_]:
-        """Fragments whose direct light steps toward a neighbour's on the same sheet."""
-        cut = np.zeros(len(fragments), dtype=bool)
-        bright = direct.sum(axis=1)
-        place = fragments.sheet * (self.height * self.width) + fragments.pixel
-        order = np.argsort(place, kind="stable")
-        known = place[order]
-        column = fragments.pixel % self.width
-        for inside, onward in ((column + 1 < self.width, 1), (np.ones(len(place), dtype=bool), self.width)):
-            one = np.flatnonzero(inside & (fragments.pixel + onward < self.height * self.width))
-            at = np.minimum(np.searchsorted(known, place[one] + onward), len(known) - 1)
-            met = known[at] == place[one] + onward
-            one, other = one[met], order[at[met]]
-            step = np.abs(bright[one] - bright[other]) > STEP * np.maximum(bright[one], bright[other])
-            cut[one[step]] = cut[other[step]] = True
+    def _bends(self, fragments: _Fragments, direct: FloatArray) -> NDArray[np.bool_]:
+        """Fragments, sorted by pixel, whose direct light steps or bends toward their neighbours on the same sheet."""
+        cut = np.empty(len(fragments), dtype=bool)
+        start = np.searchsorted(fragments.pixel, np.arange(self.height * self.width + 1))
+        turn = float(np.clip(2.0 * self.options.error, *TURN))
+        kernels.bends(fragments.pixel, fragments.sheet, direct.sum(axis=1), start, self.width, turn, cut)
         return cut
 
     # ---- indirect light -------------------------------------------------------------------------
@@ -730,6 +953,7 @@ class _Tile:
         """What nodes hold (n, 2 bands), its standard error, and harmonic mean distance (n,) of some fragments."""
         rays, where = self.options.rays, (fragments.points[rows], fragments.normals[rows])
         gatherer = self.owner.gatherer
+        assert isinstance(gatherer, Gatherer)
         # A seed of its own for each call: rows begin at 0 in all, and alike rows would err alike.
         self.calls += 1
         seed = self.owner.seed + ((self.top * self.rays.width + self.left) * 64 + self.calls) * 7919
@@ -779,6 +1003,22 @@ class _Tile:
             if not first:  # the second lattice is sampled everywhere, too: it judges the first
                 region = np.isin(cell, (np.unique(flagged)[:, None] + _AROUND).ravel())
             pitch, first = pitch // 2, False
+
+
+def _variances(moments: FloatArray) -> FloatArray:
+    """Squared relative errors (n,) of pixels.
+
+    ``moments`` of the brightness of their rays: number, sum, sum of squares, the least, and the variance from corner
+    to corner.  A few rays tell a spread but roughly, so the corners count too, and the mean of all pixels.  Relative
+    they are to what the pixel shows at least: where one ray of eight met a lamp, it may be one of a hundred.
+    """
+    count, total, square, least, corners = moments.T
+    mean, weight = total / count, count - 1.0 + POOL
+    spread = (np.maximum(square - count * mean**2, 0.0) + POOL * CORNER_SHARE * corners) / weight
+    sure = np.maximum(mean - 4.0 * NET_ERROR * np.sqrt(spread) * count**-0.75, least)
+    relative = np.where(sure > 0.0, spread / np.where(sure > 0.0, sure, 1.0) ** 2, 1.0)
+    pooled = float(np.minimum(relative, 1.0).mean())
+    return NET_ERROR**2 * (relative * (count - 1.0) + POOL * pooled) / weight * count**-1.5
 
 
 def _places(fragments: _Fragments) -> FloatArray:

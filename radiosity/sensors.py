@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import math
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,11 +30,12 @@ from workbench.counters import Counters
 from workbench.culling.tally import BOX, CHECK, CLOSED, CUT, PIECES, add_tally, new_tally
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
+from workbench.scene.model import Scene
 from workbench.shadow.lights import Sender, SphereLight, lights_of_scene
 from workbench.shadow.occlusion import ROUNDING, Shader
 from workbench.shadow.sky import SkyLight
 
-__all__ = ["Bundled", "Direct", "Gatherer", "IrradianceEstimate", "left_for_sampling"]
+__all__ = ["Bundled", "Direct", "DirectLight", "Gatherer", "IrradianceEstimate", "allotted", "left_for_sampling"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -151,19 +153,86 @@ class Direct:
     crowded: NDArray[np.bool_]
 
 
-class Gatherer:
-    """A solution made ready for many questions about the light at points.
+class DirectLight:
+    """A scene's emitters and sky, ready to be asked for the light that comes straight from them.
 
     Parameters
     ----------
-    solution : Solution
-        With the scene that it was solved for.
+    scene : Scene
     workers : int, optional
         Threads, all cores by default; the answers do not depend on it.
     seed : int
         Of the rays.
     shader : Shader, optional
         Over the scene's geometry, if there is one already; its threads are used.
+    """
+
+    def __init__(
+        self, scene: Scene, *, workers: int | None = None, seed: int = 0, shader: Shader | None = None
+    ) -> None:
+        self.scene, self.seed = scene, seed
+        self.shader = shader if shader is not None else Shader(Geometry.from_scene(scene), workers)
+        self.geometry = self.shader.geometry
+        self.workers = self.shader.workers
+        self.lights = tuple(self._senders(set()))
+        self.sky = SkyLight.of_scene(scene)
+
+    def in_blocks(self, work: Callable[[slice], None], count: int) -> None:
+        """Do ``work`` on blocks of ``count`` rays, over the threads."""
+        blocks = [slice(i, min(i + BLOCK_RAYS, count)) for i in range(0, count, BLOCK_RAYS)]
+        if self.workers > 1 and len(blocks) > 1:
+            with ThreadPoolExecutor(self.workers) as pool:
+                list(pool.map(work, blocks))
+        else:
+            for block in blocks:
+                work(block)
+
+    def _senders(self, left_out: set[int]) -> list[Sender]:
+        """All lights but emitting surfaces of some numbers."""
+        surface = self.geometry.polygon_surface
+        return [
+            light
+            for light in lights_of_scene(self.scene, self.geometry)
+            if isinstance(light, SphereLight)
+            or not len(light.polygons)
+            or int(surface[light.polygons[0]]) not in left_out
+        ]
+
+    def direct(
+        self, points: FloatArray, normals: FloatArray, *, own_polygon: ArrayLike, error: float, counters: Counters
+    ) -> Direct:
+        """Irradiance straight from lights and sky alone; arguments as of :meth:`Gatherer.irradiance`, not checked."""
+        shape = (len(points), self.scene.bands)
+        value, doubt, crowded = np.zeros(shape), np.zeros(shape), np.zeros(len(points), dtype=bool)
+        state = np.ones((len(points), len(self.lights)), dtype=np.int8)
+        if self.lights and len(points):
+            found = self.shader.estimate(
+                points, normals, self.lights, "auto", error=DIRECT_SHARE * error, seed=self.seed,
+                own_polygon=own_polygon,
+            )  # fmt: skip
+            counters.merge(found.counters)
+            state = found.state
+            value += found.irradiance
+            doubt += found.standard_error
+        if self.sky is not None and len(points):
+            shares = self.sky.shares(
+                self.shader, points, normals, own_polygon=own_polygon, error=DIRECT_SHARE * error, counters=counters
+            )
+            crowded = np.isnan(shares[:, 0])
+            shares[crowded] = 0.0
+            value += self.sky.irradiance(shares)
+        return Direct(value, doubt, state, crowded)
+
+
+class Gatherer(DirectLight):
+    """A solution made ready for many questions about the light at points.
+
+    Parameters
+    ----------
+    solution : Solution
+        With the scene that it was solved for.
+    workers, seed, shader
+        As of :class:`DirectLight`.
 
     Raises
     ------
@@ -179,10 +248,15 @@ class Gatherer:
             raise InputError(
                 f"{scene.name}: found a solution without its scene; its file was moved, so solve the scene again"
             )
-        self.seed = seed
-        self.shader = shader if shader is not None else Shader(Geometry.from_scene(scene), workers)
-        self.geometry = self.shader.geometry
-        self.workers = self.shader.workers
+        super().__init__(scene, workers=workers, seed=seed, shader=shader)
+        gathered = {
+            name
+            for name, surface in enumerate(scene.surfaces)
+            if surface.face_count > MOST_LIGHTS and surface.sphere is None
+        }
+        if gathered:
+            self.lights = tuple(self._senders(gathered))
+        self._gathered = gathered
         self._read(solution)
 
     def reading(self, solution: Solution) -> Gatherer:
@@ -199,17 +273,10 @@ class Gatherer:
         return other
 
     def _read(self, solution: Solution) -> None:
-        scene, mesh = solution.scene, solution.mesh
+        mesh = solution.mesh
         self.solution = solution
         self.lookup = ElementLookup.build(self.geometry, mesh)
-        gathered = {
-            name
-            for name, surface in enumerate(scene.surfaces)
-            if surface.face_count > MOST_LIGHTS and surface.sphere is None
-        }
-        self.lights = tuple(self._lights(gathered))
-        self.sky = SkyLight.of_scene(scene)
-        asked = ~np.isin(mesh.element_surface, list(gathered))
+        asked = ~np.isin(mesh.element_surface, list(self._gathered))
         # What rays read: reflected light, and the emission of meshes with too many facets to ask each.
         self.reflected = np.ascontiguousarray(solution.radiosity - np.where(asked[:, None], mesh.emission, 0.0))
         gradient = element_gradients(mesh, self.lookup, self.reflected)
@@ -220,17 +287,6 @@ class Gatherer:
         self._linear = np.ascontiguousarray(np.concatenate([gradient, level[..., None]], axis=2))
         first = self.geometry.piece_start[self.geometry.polygon_piece_start[:-1]]
         self._level = np.einsum("ij,ij->i", self.geometry.polygon_normal, self.geometry.corners[first])
-
-    def _lights(self, gathered: set[int]) -> list[Sender]:
-        lights = lights_of_scene(self.solution.scene, self.geometry)
-        surface = self.geometry.polygon_surface
-        return [
-            light
-            for light in lights
-            if isinstance(light, SphereLight)
-            or not len(light.polygons)
-            or int(surface[light.polygons[0]]) not in gathered
-        ]
 
     def irradiance(
         self,
@@ -339,31 +395,6 @@ class Gatherer:
             mean, spread, sky = bundle.result()
         return Bundled(mean, spread, bundle.distance(), sky)
 
-    def direct(
-        self, points: FloatArray, normals: FloatArray, *, own_polygon: ArrayLike, error: float, counters: Counters
-    ) -> Direct:
-        """Irradiance straight from lights and sky alone; arguments as in :meth:`irradiance`, but not checked."""
-        shape = (len(points), self.reflected.shape[1])
-        value, doubt, crowded = np.zeros(shape), np.zeros(shape), np.zeros(len(points), dtype=bool)
-        state = np.ones((len(points), len(self.lights)), dtype=np.int8)
-        if self.lights and len(points):
-            found = self.shader.estimate(
-                points, normals, self.lights, "auto", error=DIRECT_SHARE * error, seed=self.seed,
-                own_polygon=own_polygon,
-            )  # fmt: skip
-            counters.merge(found.counters)
-            state = found.state
-            value += found.irradiance
-            doubt += found.standard_error
-        if self.sky is not None and len(points):
-            shares = self.sky.shares(
-                self.shader, points, normals, own_polygon=own_polygon, error=DIRECT_SHARE * error, counters=counters
-            )
-            crowded = np.isnan(shares[:, 0])
-            shares[crowded] = 0.0
-            value += self.sky.irradiance(shares)
-        return Direct(value, doubt, state, crowded)
-
     # ---- indirect light -------------------------------------------------------------------------
 
     def _indirect(
@@ -408,7 +439,7 @@ class Gatherer:
                 return self._closed(bundle, who, small, allowed, counters), "exact"
             if ((spread**2).mean(axis=0) <= allowed).all():
                 break
-            target = _allotted(spread**2, bundle.count, allowed)
+            target = allotted(spread**2, bundle.count, allowed)
             wanted = int((target - bundle.count).sum())
             if wanted == 0:
                 break
@@ -434,7 +465,7 @@ class Gatherer:
             unsure = np.where(near[:, None], unsure / NET_GAIN, 0.0)
             if ((unsure**2).mean(axis=0) <= allowed).all():
                 break
-            target = _allotted(unsure**2, bundle.count, allowed)
+            target = allotted(unsure**2, bundle.count, allowed)
         return Bundled(value + fix, doubt + unsure, bundle.distance(), np.zeros_like(value))
 
     def _empty_bundle(self, points: FloatArray, normals: FloatArray, crowded: NDArray[np.bool_]) -> _Bundle:
@@ -624,11 +655,12 @@ def _power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def _allotted(variance: FloatArray, count: IntArray, allowed: FloatArray) -> IntArray:
-    """Numbers of rays (n,), powers of two, with which the mean variance of all points is within ``allowed`` (bands,).
+def allotted(variance: FloatArray, count: IntArray, allowed: FloatArray, most: int | None = None) -> IntArray:
+    """Numbers of rays (n,), powers of two, that bring the mean variance of all points to ``allowed`` (bands,).
 
     ``variance`` (n, bands) is that with ``count`` (n,) rays; it falls with their power -3/2.  The rays in all are
-    fewest (Lagrange) where each point has as many as the power 2/5 of its variance at one ray.
+    fewest (Lagrange) where each point has as many as the power 2/5 of its variance at one ray, up to ``most``
+    (:data:`MOST_RAYS` unless given).
     """
     unit = variance * (count**1.5)[:, None]
     # Of the bands, the one that is furthest from its error decides.
@@ -637,7 +669,7 @@ def _allotted(variance: FloatArray, count: IntArray, allowed: FloatArray) -> Int
     def rays(scale: float) -> FloatArray:
         with np.errstate(divide="ignore"):
             wanted = 2.0 ** np.round(np.log2(scale * worst**0.4))
-        return np.minimum(np.maximum(wanted, count), MOST_RAYS)
+        return np.minimum(np.maximum(wanted, count), most or MOST_RAYS)
 
     low, high = -20.0, 40.0  # powers of two
     while high - low > 0.05:

@@ -699,33 +699,38 @@ class Pictures(Problem):
             raise OptionError("reference: no exact picture is known; ask for converged, mitsuba or FILE.npy")
         if kind == "converged":
             return Reference(
-                "final gather to 0.3 %", self._gathered(self._solution(0.003, 7), 0.003, 7).values, 0.0, 0.003
+                "final gather to 0.3 %", self._gathered(self._source(0.003, 7), 0.003, 7).values, 0.0, 0.003
             )
         return _rival_reference(self, kind, 1024)
 
     def _gather(self) -> Technique:
         return Technique(
-            "gather", "error", (0.1, 0.05, 0.02, 0.01),
-            lambda value, seed: self._gathered(self._solution(value, seed), value, seed), kind="auto",
+            "gather", "error", (0.2, 0.1, 0.05, 0.02, 0.01, 0.005),
+            lambda value, seed: self._gathered(self._source(value, seed), value, seed), kind="auto",
         )  # fmt: skip
 
-    def _solution(self, error: float, seed: int) -> Any:
-        """A solve as good as the picture needs: of direct light, next to nothing."""
-        from radiosity.solvers.solve import solve
+    @cached_property
+    def _light(self) -> Any:
+        """The scene made ready, as rivals load theirs."""
+        from radiosity.sensors import DirectLight
 
-        least: dict[str, Any] = {"method": "progressive", "elements": 16, "tolerance": 0.9, "form_factor_error": 0.5}
-        return solve(self.scene, workers=self.workers, seed=seed, **least)
+        return DirectLight(self.scene, workers=self.workers)
 
-    def _gathered(self, solution: Any, error: float, seed: int, *, atomic: bool = True) -> Answer:
+    def _source(self, error: float, seed: int) -> Any:
+        """What a picture of an error is gathered from."""
+        return self._light
+
+    def _gathered(self, source: Any, error: float, seed: int, *, atomic: bool = True) -> Answer:
         """The final gather."""
         from radiosity.gather import GatherOptions, PictureGatherer
         from workbench.render.camera import PinholeRays
 
         choice = GatherOptions(error=error, atomic=atomic, indirect=not self.direct_only, see_backs=True)
-        gatherer = PictureGatherer(solution, choice, workers=self.workers, seed=seed)
+        gatherer = PictureGatherer(source, choice, workers=self.workers, seed=seed)
         picture = gatherer.draw(PinholeRays.from_camera(self.camera))
         counters = Counters()
-        counters.merge(solution.record.counters)
+        if source is not self._light:
+            counters.merge(source.record.counters)
         counters.merge(picture.counters)
         return Answer(picture.radiance, dict(counters), picture.measured_error)
 
@@ -736,7 +741,7 @@ class GlobalPictures(Pictures):
     what, direct_only = "picture", False
     own = ("gather", "matrix+gather", "gather-every-pixel", "mesh")
 
-    def _solution(self, error: float, seed: int) -> Any:
+    def _source(self, error: float, seed: int) -> Any:
         from radiosity.accuracy import solve
 
         # As ``radiosity render`` does: the gather refines what it reads.

@@ -12,7 +12,7 @@ from radiosity_scenes import cube_with_emitter
 
 import radiosity
 import workbench
-from radiosity.sensors import MOST_RAYS, Gatherer, _allotted
+from radiosity.sensors import MOST_RAYS, Gatherer, allotted
 from workbench.errors import InputError, OptionError
 from workbench.scene.library import box_surface, diffuse, unit_cube
 from workbench.scene.model import Scene, Surface
@@ -106,9 +106,9 @@ def test_too_few_rays_are_said(cornell, monkeypatch):
     st.lists(st.sampled_from([16, 64, 1024]), min_size=30, max_size=30),
     st.floats(1e-4, 10.0),
 )
-def test_rays_are_allotted_as_the_error_allows(spread, counts, allowed):
+def test_rays_areallotted_as_the_error_allows(spread, counts, allowed):
     variance, count = np.square(spread)[:, None], np.array(counts[: len(spread)])
-    rays = _allotted(variance, count, np.array([allowed]))
+    rays = allotted(variance, count, np.array([allowed]))
     assert ((rays >= count) & (rays & (rays - 1) == 0)).all()
     foretold = (variance[:, 0] * (count / rays) ** 1.5).mean()
     assert foretold <= allowed * (1 + 1e-9) or (rays[np.array(spread) > 0] == MOST_RAYS).all()

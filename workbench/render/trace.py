@@ -45,7 +45,7 @@ from workbench.shadow.occlusion import OcclusionEstimate, OcclusionState, Shader
 from workbench.shadow.rays import NOISE
 from workbench.shadow.sky import SkyLight
 
-__all__ = ["ComponentCount", "DiffuseEnds", "RayTally", "TraceOptions", "Traced", "Tracer"]
+__all__ = ["ComponentCount", "DiffuseEnds", "RayTally", "TraceOptions", "Traced", "Tracer", "corner_normals"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -372,7 +372,7 @@ class _Materials:
         self.emits = self.radiance.any(axis=1)
 
 
-def _corner_normals(scene: Scene, geometry: Geometry) -> FloatArray:
+def corner_normals(scene: Scene, geometry: Geometry) -> FloatArray:
     """Normals at the corners of the geometry's triangles (t, 3, 3); empty if no surface is smooth."""
     if all(surface.vertex_normals is None for surface in scene.surfaces):
         return np.empty((0, 3, 3))
@@ -451,7 +451,7 @@ class Tracer:
         polygon = self.geometry.piece_polygon[piece]
         self._triangles = triangles
         self._first_triangle = np.searchsorted(polygon, np.arange(self.geometry.polygon_count + 1))
-        self._corner_normals = _corner_normals(scene, self.geometry)
+        self._corner_normals = corner_normals(scene, self.geometry)
         self._surface = np.append(self.geometry.polygon_surface, NO_SURFACE).astype(np.int32)
         self._all = EmbreeAccelerator(self.geometry)
         self.offset = self._all.offset
