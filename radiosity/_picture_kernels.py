@@ -184,12 +184,14 @@ def bends(pixel, sheet, bright, start, width, turn, cut):
     pixels = start.shape[0] - 1
     for i in range(pixel.shape[0]):
         cut[i] = False
+        row = np.uint64(pixel[i]) // np.uint64(width)  # signed divisions take several times as long
+        column = pixel[i] - np.int64(row) * width
         for axis in range(2):
             stride = 1 if axis == 0 else width
             before, after = -1, -1
-            if axis == 1 or pixel[i] % width > 0:
+            if axis == 1 or column > 0:
                 before = _beside(pixel[i] - stride, sheet[i], sheet, start, pixels)
-            if axis == 1 or pixel[i] % width < width - 1:
+            if axis == 1 or column < width - 1:
                 after = _beside(pixel[i] + stride, sheet[i], sheet, start, pixels)
             here = bright[i]
             if before >= 0 and after >= 0:
@@ -198,9 +200,9 @@ def bends(pixel, sheet, bright, start, width, turn, cut):
                 one = max(before, after)
                 off, most = abs(here - bright[one]), bright[one]
                 beyond = -1
-                place = 2 * pixel[one] - pixel[i]
-                if axis == 1 or place // width == pixel[i] // width:
-                    beyond = _beside(place, sheet[i], sheet, start, pixels)
+                way = pixel[one] - pixel[i]
+                if axis == 1 or 0 <= column + 2 * way < width:
+                    beyond = _beside(pixel[i] + 2 * way, sheet[i], sheet, start, pixels)
                 if beyond >= 0:  # what the next two foretell
                     off = min(off, abs(here - 2.0 * bright[one] + bright[beyond]))
             else:

@@ -58,12 +58,14 @@ APART = 1e6
 """Distance between sheets in the tree of nodes. [pixels]"""
 STEP = 0.1
 """Relative step of radiance inside a pixel from which it is sampled inside."""
-TURN = (0.02, 0.2)
-"""Relative second difference of direct light between pixels from which it is too: twice the error, within these."""
+TURN = 2.0
+"""Relative second difference of direct light between pixels, as a multiple of the error, from which it is too."""
 TRUSTED = 0.05
 """Error from which a pixel whose corners saw one polygon is taken to show it in its middle, without a ray."""
-FIRST_PLACES, MOST_PLACES = 8, 1024
-"""Rays from the eye in a pixel that shows an edge, before it is known how many it needs, and the most of them."""
+MOST_TURN = 0.2
+FIRST_PLACES, MOST_PLACES = (4, 8), 4096
+"""Rays from the eye in a pixel that shows an edge, before it is known how many it needs (first where the error is
+:data:`TRUSTED` or more), and the most of them."""
 INSIDE_ERROR = 0.55
 """Share of the error that edges in pixels may make."""
 NET_ERROR = 0.6
@@ -154,7 +156,7 @@ class GatherOptions:
     @property
     def check_places(self) -> int:
         """Rays from the eye in a pixel that is drawn again to tell the error."""
-        return int(np.clip(2 ** round(math.log2(2.56 / self.error)), 32, MOST_PLACES))
+        return int(np.clip(2 ** round(math.log2(2.56 / self.error)), 32, 1024))
 
 
 @dataclass
@@ -293,6 +295,11 @@ class PictureGatherer:
         self._slopes: FloatArray | None = None
         self._places = sobol(MOST_PLACES, np.random.default_rng(seed))
         self.ambient = self._ambient()
+
+    @property
+    def elements_read(self) -> int:
+        """Elements of the mesh that bundles read."""
+        return self.gatherer.solution.mesh.element_count if isinstance(self.gatherer, Gatherer) else 0
 
     @cached_property
     def _tracer(self) -> Tracer:
@@ -740,11 +747,10 @@ class _Tile:
         whole, edges, corners = self._whole_pixels(radiance)
         straight = self._direct(whole)
         direct = straight.irradiance
-        bent = np.unique(whole.pixel[self._bends(whole, direct)])
-        cut = np.zeros(shape, dtype=bool)
-        cut[edges] = cut[bent] = True
         shadow = np.zeros(shape, dtype=bool)
-        shadow[bent] = True
+        shadow[whole.pixel[self._bends(whole, direct)]] = True
+        cut = shadow.copy()
+        cut[edges] = True
         radiance[cut] = 0.0
         kept = ~cut[whole.pixel]
         self.samples["camera"] += 1  # a corner
@@ -854,7 +860,10 @@ class _Tile:
         seen, moments = np.zeros((len(pixels), bands)), np.zeros((len(pixels), 5))
         moments[:, 3], moments[:, 4] = math.inf, corners
         parts: list[tuple[_Fragments, IntArray, FloatArray, NDArray[np.bool_]]] = []
-        target = np.full(len(pixels), FIRST_PLACES if allowed is not None else self.options.check_places)
+        target = np.full(
+            len(pixels),
+            self.options.check_places if allowed is None else FIRST_PLACES[self.options.error < TRUSTED],
+        )
         for _ in range(INSIDE_ROUNDS if allowed is not None else 1):
             self._cast(pixels, shadow, count, target, seen, moments, parts)
             count = np.maximum(count, target)
@@ -942,9 +951,11 @@ class _Tile:
     def _bends(self, fragments: _Fragments, direct: FloatArray) -> NDArray[np.bool_]:
         """Fragments, sorted by pixel, whose direct light steps or bends toward their neighbours on the same sheet."""
         cut = np.empty(len(fragments), dtype=bool)
-        start = np.searchsorted(fragments.pixel, np.arange(self.height * self.width + 1))
-        turn = float(np.clip(2.0 * self.options.error, *TURN))
-        kernels.bends(fragments.pixel, fragments.sheet, direct.sum(axis=1), start, self.width, turn, cut)
+        start = np.zeros(self.height * self.width + 1, dtype=np.int64)
+        np.cumsum(np.bincount(fragments.pixel, minlength=len(start) - 1), out=start[1:])
+        bright = direct.sum(axis=1)
+        turn = min(TURN * self.options.error, MOST_TURN)
+        kernels.bends(fragments.pixel, fragments.sheet, bright, start, self.width, turn, cut)
         return cut
 
     # ---- indirect light -------------------------------------------------------------------------

@@ -335,7 +335,7 @@ def _render_gathered(
     pixels = camera.width * camera.height
     record.results |= {
         "elements": solution.mesh.element_count,
-        "elements_read": gatherer.gatherer.solution.mesh.element_count,
+        "elements_read": gatherer.elements_read,
         "samples_per_pixel": {name: float(count.mean()) for name, count in picture.samples.items()},
     }
     if json_path is not None:
@@ -345,7 +345,7 @@ def _render_gathered(
         f"{record.errors['picture_relative_rms']:.2g} where {wanted:g} was asked; "
         + ", ".join(f"{count.sum() / pixels:.3g} {name}" for name, count in picture.samples.items())
         + " samples a pixel",
-        f"{record.counters['rays']:,} rays; read from {gatherer.gatherer.solution.mesh.element_count} elements",
+        f"{record.counters['rays']:,} rays; read from {gatherer.elements_read} elements",
         "seconds: " + "; ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()),
         *map(str, files),
     ]

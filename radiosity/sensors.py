@@ -12,7 +12,6 @@ import copy
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -52,8 +51,8 @@ MOST_RAYS = 65536
 """Most rays a point."""
 MOST_ROUNDS = 8
 """Rounds in which rays are added where the spread says that they are too few."""
-BLOCK_RAYS = 16384
-"""Rays made, traced and read at once: few enough that all threads have some of them."""
+BLOCK_RAYS, LEAST_RAYS = 16384, 2048
+"""Rays made, traced and read at once: few enough that all threads have some of them, and more than a thread costs."""
 MOST_PANES = 8
 """Panes in a row that a ray goes through."""
 NET_GAIN = 0.7
@@ -179,13 +178,8 @@ class DirectLight:
 
     def in_blocks(self, work: Callable[[slice], None], count: int) -> None:
         """Do ``work`` on blocks of ``count`` rays, over the threads."""
-        blocks = [slice(i, min(i + BLOCK_RAYS, count)) for i in range(0, count, BLOCK_RAYS)]
-        if self.workers > 1 and len(blocks) > 1:
-            with ThreadPoolExecutor(self.workers) as pool:
-                list(pool.map(work, blocks))
-        else:
-            for block in blocks:
-                work(block)
+        step = min(BLOCK_RAYS, max(LEAST_RAYS, -(-count // self.workers)))
+        self.shader.spread(work, [slice(i, min(i + step, count)) for i in range(0, count, step)])
 
     def _senders(self, left_out: set[int]) -> list[Sender]:
         """All lights but emitting surfaces of some numbers."""
@@ -519,11 +513,7 @@ class Gatherer(DirectLight):
             return tally
 
         blocks = np.array_split(rows, max(1, len(rows) // 16)) if len(rows) else []
-        if self.workers > 1 and len(blocks) > 1:
-            with ThreadPoolExecutor(self.workers) as pool:
-                done = list(pool.map(work, blocks))
-        else:
-            done = [work(block) for block in blocks]
+        done = self.shader.spread(work, blocks)
         cost = GROUP_COST * parts.groups * len(rows)
         for tally in done:
             add_tally(counters, tally)
@@ -600,11 +590,7 @@ class Gatherer(DirectLight):
             bundle.reach[block] += near
             return traced, hits, (block, close, kept, element, side)
 
-        if self.workers > 1 and len(blocks) > 1:
-            with ThreadPoolExecutor(self.workers) as pool:
-                done = list(pool.map(work, blocks))
-        else:
-            done = [work(block) for block in blocks]
+        done = self.shader.spread(work, blocks)
         counters.add(rays=sum(traced for traced, *_ in done), rays_hit=sum(hits for _, hits, _ in done))
         if bundle.deep:
             self._correct(bundle, [close for *_, close in done], counters)

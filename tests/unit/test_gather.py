@@ -11,19 +11,20 @@ from hypothesis import strategies as st
 from picture_scenes import camera, furnace, lit_floor, solved, straight_down
 
 from radiosity import gather
-from radiosity._picture_kernels import local_fits
+from radiosity._picture_kernels import bends, local_fits
 from radiosity.gather import GatherOptions, Picture, PictureGatherer
 from radiosity.patches import _area_and_centroid, _vector_areas, build_mesh
 from radiosity.regather import _cut, regathered
-from radiosity.sensors import Gatherer
+from radiosity.sensors import DirectLight, Gatherer
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.scene.library import box_surface, diffuse
-from workbench.scene.model import Material, Scene, Surface
+from workbench.scene.model import Material, Scene, Sky, Surface
 
 # light/quad-row and shadow/square/row-a=0.4 of truth.json (Lambert 1760; Baum, Rushmeier and Winget 1989)
 QUAD_ROW = {0.0: 0.23083679773017077, 0.5: 0.207918813257321, 1.0: 0.1555774353085024, 2.0: 0.06370584387198608}
 SQUARE_ROW = {0.0: 0.07891872804788831, 0.25: 0.11013944131305949, 0.5: 0.14985312372514176, 1.0: 0.1555774353085024}
+RED = diffuse("red", (0.7, 0.1, 0.1), bands=3)
 OCCLUDER = [[-0.2, -0.2, 1], [0.2, -0.2, 1], [0.2, 0.2, 1], [-0.2, 0.2, 1]]
 
 
@@ -253,3 +254,84 @@ def test_cut_elements_tile_what_they_cut(seed):
         assert (np.einsum("ij,ij->i", turn, finer.piece_normal) > 0).all()
         assert (np.diff(finer.element_patch) >= 0).all()
         mesh = finer
+
+
+def test_a_scene_alone_gives_its_direct_light():
+    scene = lit_floor(OCCLUDER, bands=3)
+    view = camera((0, -3, 1.5), (0, 0, 0.2), width=17, height=13)
+    options = GatherOptions(error=0.05, indirect=False)
+    alone = PictureGatherer(DirectLight(scene, workers=1), options).draw(view)
+    solved_one = PictureGatherer(solved(scene), options, workers=1).draw(view)
+    np.testing.assert_allclose(alone.radiance, solved_one.radiance, rtol=1e-12)
+    assert alone.radiance.any()
+    with pytest.raises(OptionError, match="indirect"):
+        PictureGatherer(DirectLight(scene, workers=1))
+    with pytest.raises(OptionError, match="sky"):
+        sky = Sky("uniform", np.zeros(3), zenith_radiance=np.ones(3))
+        PictureGatherer(DirectLight(replace(scene, sky=sky), workers=1), options)
+
+
+def test_plain_scenes_look_as_the_tracer_sees_them():
+    # The quick way of scenes where no ray leads on, against the one that follows mirrors: the same fragments, so the
+    # same picture; backs and smooth normals included.
+    box = box_surface("box", RED, (-0.3, 0.1, 0), (0.2, 0.5, 0.6))
+    back = Surface.from_polygons("back", diffuse("back", 0.5, bands=3), [np.array(OCCLUDER, float)[::-1] - (1, 0, 0)])
+    scene = lit_floor(OCCLUDER, bands=3)
+    scene = replace(scene, surfaces=(*scene.surfaces, box, back))
+    view = camera((0.3, -3, 1.6), (0, 0, 0.3), width=21, height=17)
+    for see_backs in (False, True):
+        gatherers = [
+            PictureGatherer(
+                DirectLight(scene, workers=1), GatherOptions(error=0.02, indirect=False, see_backs=see_backs)
+            )
+            for _ in range(2)
+        ]
+        gatherers[1]._leads_on = True
+        one, two = (gatherer.draw(view) for gatherer in gatherers)
+        np.testing.assert_allclose(one.radiance, two.radiance, rtol=1e-6, atol=1e-9)
+        assert one.radiance.any()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_steps_and_bends_of_light_are_found_and_slopes_are_not(axis):
+    height, width = 9, 12
+    place = np.indices((height, width))[axis]
+
+    def marked(bright, sheet=None, turn=0.1):
+        pixel = np.arange(height * width)
+        cut = np.empty(height * width, dtype=bool)
+        sheets = np.zeros(height * width, dtype=np.int64) if sheet is None else sheet.ravel()
+        bends(pixel, sheets, np.ravel(bright).astype(float), np.arange(height * width + 1), width, turn, cut)
+        return cut.reshape(height, width)
+
+    assert not marked(1.0 + 0.5 * place).any()
+    step = marked(np.where(place < 4, 1.0, 1.3))
+    assert (step == ((place == 3) | (place == 4))).all()
+    assert (marked(np.abs(place - 4.0) + 5.0) == (place == 4)).all()  # 2 of 5
+    # Across the border of a sheet light is not compared.
+    assert not marked(np.where(place < 4, 1.0, 1.3), sheet=(place < 4).astype(np.int64)).any()
+
+
+@pytest.mark.parametrize("error", [0.1, 0.03])
+def test_pixels_with_edges_are_as_right_as_was_asked(error):
+    # Against 1,024 rays in each pixel: the root of the mean square of relative errors, where there is light to speak of
+    # (of what a black pixel shows at its rim no error is relative).
+    box = box_surface("box", RED, (-0.3, 0.1, 0), (0.2, 0.5, 0.6))
+    scene = lit_floor(OCCLUDER, bands=3)
+    scene = replace(scene, surfaces=(*scene.surfaces, box))
+    view = camera((0.3, -3, 1.6), (0, 0, 0.3), width=32, height=24)
+    off = []
+    for seed in range(3):
+        gatherer = PictureGatherer(DirectLight(scene, workers=1), GatherOptions(error=error, indirect=False), seed=seed)
+        picture = gatherer.draw(view)
+        if seed == 0:
+            tile = gather._Tile(Picture(gatherer, view), 0, 0, 32, 24)
+            gatherer.options = GatherOptions(error=0.0025, indirect=False)
+            exact, _ = tile.drawn_alone(np.arange(32 * 24))
+            gatherer.options = GatherOptions(error=error, indirect=False)
+        norm = (exact**2).sum(axis=1)
+        square = ((picture.radiance.reshape(-1, 3) - exact) ** 2).sum(axis=1)
+        lit = norm > 0.01 * norm.mean()
+        off.append(square[lit] / norm[lit])
+        assert picture.samples["camera"].mean() < 64
+    assert np.sqrt(np.mean(off)) < error

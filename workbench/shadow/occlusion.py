@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,6 +65,8 @@ __all__ = ["METHODS", "AreaLight", "OcclusionEstimate", "OcclusionState", "Shade
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+_Each = TypeVar("_Each")
+_Done = TypeVar("_Done")
 
 METHODS = ("adaptive", "auto", "camera", "camera-optimised", "exact", "rays", "rays+plane-vertex", "shaft")
 """Methods by name: see :func:`estimate`."""
@@ -318,6 +321,16 @@ class Shader:
             for material in self.geometry.surface_material
         )
         return VoxelGrid(replace(self.geometry, surface_material=grey), workers=self.workers)
+
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self.workers)
+
+    def spread(self, work: Callable[[_Each], _Done], tasks: Sequence[_Each]) -> list[_Done]:
+        """``work`` on each task, over threads that are kept; tasks must not spread work themselves."""
+        if self.workers == 1 or len(tasks) <= 1:
+            return [work(task) for task in tasks]
+        return list(self._pool.map(work, tasks))
 
     def estimate(
         self,
@@ -633,10 +646,7 @@ class Shader:
         """Tallies of ``work(first, last)`` over ``most`` equal ranges of ``count`` rows, on all workers."""
         step = max(1, -(-count // most))
         ranges = [(first, min(first + step, count)) for first in range(0, count, step)]
-        if self.workers == 1 or len(ranges) == 1:
-            return [work(*each) for each in ranges]
-        with ThreadPoolExecutor(self.workers) as pool:
-            return list(pool.map(lambda each: work(*each), ranges))
+        return self.spread(lambda each: work(*each), ranges)
 
     def _finish(
         self, tiles: Tiles, ring: FloatArray, normal: FloatArray, owners: IntArray, own: int, found: _Settled,
@@ -776,9 +786,8 @@ class Shader:
             )  # fmt: skip
             return tally
 
-        with ThreadPoolExecutor(self.workers) as pool:
-            for tally in pool.map(work, np.array_split(waiting, max(1, len(waiting) // 256))):
-                add_tally(task.counters, tally)
+        for tally in self.spread(work, np.array_split(waiting, max(1, len(waiting) // 256))):
+            add_tally(task.counters, tally)
         doubt += unsure
 
     def _camera(

@@ -9,7 +9,6 @@ Gauss's rule on ever smaller triangles.  Where occluders are too many to cut, ca
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -188,10 +187,9 @@ class SkyLight:
             )  # fmt: skip
             return tally
 
-        with ThreadPoolExecutor(shader.workers) as pool:
-            for tally in pool.map(work, range(0, len(place), step)):
-                if counters is not None:
-                    add_tally(counters, tally)
+        for tally in shader.spread(work, range(0, len(place), step)):
+            if counters is not None:
+                add_tally(counters, tally)
         return out
 
     def irradiance(self, shares: FloatArray) -> FloatArray:
