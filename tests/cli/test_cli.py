@@ -153,6 +153,9 @@ def test_ctrl_c_leaves_a_usable_solution_and_resume_goes_on(room, tmp_path, monk
     assert not part.converged and part.stopped == "interrupted"
 
     monkeypatch.setattr(radiosity, "solve", real)
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    assert refused(run("solve", "l-room", "-o", out, "--resume"), "found the solution of .*expected one of 'L-room'")
+    assert before == {file.name: file.read_bytes() for file in out.iterdir()}
     result = run("solve", room, "-o", out, "--resume", "--tolerance", 1e-6)
     assert result.exit_code == 0, result.output
     done, whole = radiosity.Solution.load(out), radiosity.Solution.load(tmp_path / "whole")

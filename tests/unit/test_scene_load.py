@@ -75,6 +75,8 @@ def test_each_suffix_has_its_reader(tmp_path):
 def test_unknown_kinds_and_names_say_what_is_known(tmp_path):
     with pytest.raises(SceneError, match=r"scene\.blend: found an unknown kind of file, expected one of \.toml, \.obj"):
         load(tmp_path / "scene.blend")
+    with pytest.raises(SceneError, match="found a folder, expected a scene file"):
+        load(tmp_path)
     with pytest.raises(SceneError, match="did you mean 'cornell-box'"):
         load("cornel-box")
     with pytest.raises(SceneError, match="`radiosity scenes` lists"):

@@ -81,6 +81,8 @@ def load(path: str | Path) -> Scene:
     built_in = _built_in_files()
     if str(path) in built_in and not path.is_file():
         return load(built_in[str(path)])
+    if path.is_dir():
+        raise SceneError("found a folder, expected a scene file or the name of a built-in scene", path=path)
     if "." in path.name.strip(".") or path.exists():
         raise SceneError(f"found an unknown kind of file, expected one of {', '.join(SUFFIXES)}", path=path)
     close = difflib.get_close_matches(str(path), built_in, n=1)
