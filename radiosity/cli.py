@@ -216,8 +216,8 @@ def solve(
             previous = radiosity.Solution.load(directory)
             if (solved := previous.record.settings["scene"]) != loaded.name:
                 raise InputError(
-                    f"{directory}: found the solution of {solved!r}, expected one of {loaded.name!r}; give that scene or "
-                    "leave out --resume"
+                    f"{directory}: found the solution of {solved!r}, expected one of {loaded.name!r}; give that scene "
+                    "or leave out --resume"
                 )
             options |= _asked_before(previous.record.settings, options)
         if options["error"] is not None or options["budget_seconds"] is not None:
