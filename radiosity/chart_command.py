@@ -329,9 +329,10 @@ def _write_report(
     record = RunRecord("chart", settings=settings)
     machine = record.machine
     title = f"{settings['title']}\nerror against {judge.name}; {machine['processor']}, {problem.workers} threads"
+    floor = problem.floor(judge)
     figure = Figure(layout="constrained")
     FigureCanvasAgg(figure)
-    draw_chart(figure, points, title=title, label=problem.error_label, floor=judge.error)
+    draw_chart(figure, points, title=title, label=problem.error_label, floor=floor, noise=judge.error)
     drawn = io.StringIO()
     with rc_context({"svg.hashsalt": "radiosity", "svg.fonttype": "none"}):
         figure.savefig(drawn, format="svg", bbox_inches="tight", metadata={"Date": None})
@@ -360,11 +361,14 @@ def _write_report(
         | {f"machine: {k}": v for k, v in machine.items()}
         | {f"version: {k}": v for k, v in record.versions.items()}
     )
-    facts["error of the reference"] = f"{judge.error:.2g}"
+    facts["the reference tells errors from"] = f"{floor:.2g}"
+    facts["noise of the reference, taken off" if floor < judge.error else "error of the reference"] = (
+        f"{judge.error:.2g}"
+    )
     page = html_page(settings["title"], drawn.getvalue(), tables, notes, facts)
     write_text_atomically(directory / "report.html", page)
     record.results = {"points": rows, "seconds to an error": reached, "frontier": order, "notes": notes}
-    record.results["reference error"] = judge.error
+    record.results |= {"reference error": judge.error, "reference floor": floor}
     record.write(directory / "record.json")
     return [directory / name for name in ("records.csv", "chart.svg", "chart.png", "report.html", "record.json")]
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from workbench.errors import InputError
 
-__all__ = ["at_error", "frontier", "relative_rms", "slope"]
+__all__ = ["at_error", "frontier", "relative_rms", "resolution", "slope"]
 
 FloatArray = NDArray[np.float64]
 
@@ -50,6 +50,23 @@ def relative_rms(found: ArrayLike, reference: ArrayLike, variance: ArrayLike = 0
     spread = float(rows.std(ddof=1)) / math.sqrt(len(rows)) if len(rows) > 1 else 0.0
     # d sqrt(x) = dx / (2 sqrt x); near 0 the root of the spread is all that can be said.
     return error / mean, min(spread / (2.0 * error) if error > 0 else math.inf, math.sqrt(spread)) / mean
+
+
+def resolution(reference: ArrayLike, variance: ArrayLike) -> float:
+    """Least relative error that can be told from none, against a reference whose noise is taken off.
+
+    The squared noise of a row has a standard deviation of sqrt(2) times its variance (of Gaussian noise, alike in
+    all bands); twice the standard error of the mean over the rows is what may be left of it.
+
+    Parameters
+    ----------
+    reference, variance : (n, ...) float
+        As in :func:`relative_rms`.
+    """
+    exact, noise = np.asarray(reference, dtype=np.float64), np.asarray(variance, dtype=np.float64)
+    rows = noise.reshape(len(noise), -1).mean(axis=1)
+    left = 2.0 * math.sqrt(2.0 * float((rows**2).sum())) / len(rows)
+    return math.sqrt(left) / float(np.abs(exact).mean())
 
 
 def frontier(seconds: Sequence[float], errors: Sequence[float]) -> list[int]:

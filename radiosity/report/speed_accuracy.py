@@ -542,13 +542,15 @@ _COLOURS = (
 _MARKERS = "osD^vPX<>hp8"
 
 
-def draw_chart(figure: Figure, points: Sequence[Point], *, title: str, label: str, floor: float = 0.0) -> None:
+def draw_chart(
+    figure: Figure, points: Sequence[Point], *, title: str, label: str, floor: float = 0.0, noise: float = 0.0,
+) -> None:  # fmt: skip
     """Error against seconds on logarithmic axes, into an empty figure.
 
     Ours are drawn in full lines, rivals in dashed ones with open markers, automatic choices as
     stars; the frontier of all is a broad grey line, and points that are tied with it (:func:`ranking`)
     have a grey ring.  Bars reach over the spread of the runs and over one standard error.  Below
-    ``floor``, the reference's own error, nothing can be told.
+    ``floor`` nothing can be told; ``noise`` is that of the reference, which has been taken off.
     """
     figure.set_size_inches(9.5, 6.2)
     axes = figure.subplots()
@@ -604,8 +606,9 @@ def draw_chart(figure: Figure, points: Sequence[Point], *, title: str, label: st
     if floor > 0:
         low, high = axes.get_ylim()
         axes.set_ylim(min(low, 0.5 * floor), high)
-        axes.axhspan(min(low, 0.5 * floor), floor, color="0.93", zorder=0)
-        axes.axhline(floor, color="0.5", lw=0.8, ls=":", label="error of the reference itself (taken off)")
+        axes.axhspan(min(low, 0.5 * floor), floor, color="0.93", zorder=0, label="the reference tells nothing here")
+    if noise > floor:
+        axes.axhline(noise, color="0.5", lw=0.8, ls=":", label="noise of the reference, taken off")
     for share in (0.1, 0.01, 0.001):
         low, high = axes.get_ylim()
         if low < share < high:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radiosity.report.metrics import resolution
 from radiosity.rivals import RIVALS, Rival, absent, open_rival
 from radiosity.rivals.base import black_lamps
 from radiosity.surface_grid import surface_grid
@@ -73,7 +74,10 @@ class Technique:
 
 @dataclass(frozen=True)
 class Reference:
-    """What answers are judged by: ``values`` (n, ...), their ``variance`` and relative ``error`` where known."""
+    """What answers are judged by: ``values`` (n, ...), their ``variance`` and relative ``error`` where known.
+
+    With a variance, which is taken off, ``error`` is the relative noise.
+    """
 
     name: str
     values: FloatArray
@@ -131,6 +135,12 @@ class Problem:
     def judged(self, values: FloatArray) -> FloatArray:
         """Values as they are compared."""
         return values
+
+    def floor(self, reference: Reference) -> float:
+        """Relative error below which nothing can be told with that reference."""
+        if isinstance(reference.variance, np.ndarray) and reference.variance.any():
+            return resolution(self.judged(reference.values), self.judged(reference.variance))
+        return reference.error
 
 
 def _rival_answers(name: str) -> frozenset[str]:
@@ -550,19 +560,19 @@ class Solve(Problem):
             stated = math.hypot(float(solution.record.errors["estimate"]["total"]), self.gather_share * value)
             return Answer(values, counters, stated)
 
-        return Technique("auto", "error", (0.1, 0.05, 0.02, 0.01, 0.005), ask, kind="auto")
+        return Technique("auto", "error", (0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001), ask, kind="auto")
 
     def _hierarchical(self) -> Technique:
         return self._meshed("hierarchical", "hierarchical", (100, 400, 1600), False)
 
     def _hierarchical_gather(self) -> Technique:
-        return self._meshed("hierarchical+gather", "hierarchical", (100, 200, 800, 3200), True)
+        return self._meshed("hierarchical+gather", "hierarchical", (100, 200, 800, 3200, 12800), True)
 
     def _matrix(self) -> Technique:
         return self._meshed("matrix", "matrix", (100, 400, 1600), False)
 
     def _matrix_gather(self) -> Technique:
-        return self._meshed("matrix+gather", "matrix", (16, 50, 200, 400, 800, 1600, 3200), True)
+        return self._meshed("matrix+gather", "matrix", (16, 50, 200, 400, 800, 1600, 3200, 6400), True)
 
     def _progressive(self) -> Technique:
         return self._meshed("progressive", "progressive", (100, 400, 1600), False)
@@ -586,7 +596,7 @@ class Solve(Problem):
         def ask(value: float, seed: int) -> Answer:
             return Answer(rival.irradiance(self.points, self.normals, samples=int(value), seed=seed))
 
-        return Technique(name, "samples", (16, 64, 256, 1024, 4096), ask, kind="rival")
+        return Technique(name, "samples", (16, 64, 256, 1024, 4096, 16384), ask, kind="rival")
 
     def reference(self, kind: str) -> Reference:
         """A matrix solve of 4,000 elements gathered to 0.1 %, or 8 x 4,096 samples of a rival."""
@@ -691,7 +701,7 @@ class Pictures(Problem):
         def ask(value: float, seed: int) -> Answer:
             return Answer(rival.picture(self.camera, samples=int(value), seed=seed, direct_only=self.direct_only))
 
-        return Technique(name, "samples a pixel", (1, 4, 16, 64, 256, 1024), ask, kind="rival")
+        return Technique(name, "samples a pixel", (1, 4, 16, 64, 256, 1024, 4096), ask, kind="rival")
 
     def reference(self, kind: str) -> Reference:
         """A final gather to 0.3 %, or 8 x 1,024 samples a pixel of a rival."""
@@ -705,7 +715,7 @@ class Pictures(Problem):
 
     def _gather(self) -> Technique:
         return Technique(
-            "gather", "error", (0.2, 0.1, 0.05, 0.02, 0.01, 0.005),
+            "gather", "error", (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001),
             lambda value, seed: self._gathered(self._source(value, seed), value, seed), kind="auto",
         )  # fmt: skip
 
@@ -764,7 +774,7 @@ class GlobalPictures(Pictures):
         return Technique(name, "elements", values, ask)
 
     def _matrix_gather(self) -> Technique:
-        return self._by_elements("matrix+gather", (16, 50, 200, 800), True)
+        return self._by_elements("matrix+gather", (16, 50, 200, 800, 3200), True)
 
     def _gather_every_pixel(self) -> Technique:
         return self._by_elements("gather-every-pixel", (16, 50, 200), False)

@@ -38,8 +38,8 @@ FIGURES = {
 }
 """The other figures of README that are drawn from measurements: NAME.png from the command."""
 PROGRAM = [sys.executable, "-c", "from radiosity.cli import main; main()"]
-LIMIT = "2"
-"""Seconds of a run after which finer settings of its technique are left out."""
+LIMIT, LONGEST = "2", "12"
+"""Seconds of a run beyond which it is not repeated, and after which finer settings of its technique are left out."""
 
 
 def run(folder: Path, name: str, against: Path | None) -> int:
@@ -49,7 +49,7 @@ def run(folder: Path, name: str, against: Path | None) -> int:
         arguments[-1] = "converged"
     if against is not None:
         arguments += ["--compare", str(against / name)]
-    command = [*PROGRAM, "chart", *arguments, "--limit", LIMIT, "-o", str(folder / name)]
+    command = [*PROGRAM, "chart", *arguments, "--limit", LIMIT, "--longest", LONGEST, "-o", str(folder / name)]
     return subprocess.run(command, check=False).returncode
 
 

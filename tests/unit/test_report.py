@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from radiosity.report.metrics import at_error, frontier, relative_rms, slope
+from radiosity.report.metrics import at_error, frontier, relative_rms, resolution, slope
 from radiosity.report.page import html_page
 from radiosity.report.speed_accuracy import (
     MORE,
@@ -54,6 +54,18 @@ def test_relative_rms_takes_off_the_noise_of_the_reference():
     found = truth + 0.04 * rng.normal(size=truth.shape)
     error, doubt = relative_rms(found, reference, 0.03**2)
     assert abs(error - 0.04) < 5 * doubt and doubt < 0.001
+
+
+def test_resolution_bounds_what_is_left_of_the_noise():
+    """A perfect answer against references with known noise: what is left is below the resolution 19 times of 20."""
+    rng = np.random.default_rng(2)
+    truth = np.ones((1000, 1))
+    level = 0.03 * rng.uniform(0.2, 2.0, truth.shape)
+    least = resolution(truth, level**2)
+    left = [relative_rms(truth, truth + level * rng.normal(size=truth.shape), level**2)[0] for _ in range(400)]
+    assert 0.2 < least / np.sqrt((level**2).mean()) < 0.5  # far below the noise
+    # Twice the standard error, on one side: 2.3 % of a normal distribution.
+    assert np.mean(np.array(left) > least) < 0.05 and np.mean(np.array(left) > 0.5 * least) > 0.05
 
 
 def test_relative_rms_refuses_what_has_no_meaning():
@@ -276,7 +288,7 @@ def test_a_rerun_within_the_spread_is_reproduced():
 def test_chart_draws_every_technique_and_zero_errors():
     runs, _ = measure(Coin(), Reference("truth", np.ones((4, 1))), [(n, None) for n in ("halving", "exact", "auto")])
     figure = Figure(layout="constrained")
-    draw_chart(figure, points_of(runs), title="t", label="e", floor=0.01)
+    draw_chart(figure, points_of(runs), title="t", label="e", floor=0.01, noise=0.02)
     figure.savefig("/dev/null", format="png")
     texts = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert any(text.startswith("halving, slope") or text == "halving" for text in texts)
