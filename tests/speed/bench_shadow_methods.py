@@ -20,7 +20,7 @@ from pathlib import Path
 from bench_shadow_points import scattered
 
 from radiosity.chart_command import _scene
-from radiosity.report.speed_accuracy import auto_ratios, measure, points_of
+from radiosity.report.speed_accuracy import Run, auto_ratios, measure, points_of
 from radiosity.report.techniques import Shadows
 from workbench.errors import WorkbenchError
 from workbench.scene.load import built_in_scenes
@@ -55,6 +55,11 @@ def rows_of(name: str, grid: tuple[int, int], count: int, repeats: int, limit: f
     runs, notes = measure(problem, problem.reference("exact"), PLAN, repeats=repeats, limit=limit)
     for note in notes:
         print(f"{name}: {note}")
+    return ratios(name, runs, {"points": len(problem.sensors.points)})
+
+
+def ratios(name: str, runs: list[Run], size: dict[str, int]) -> list[dict]:
+    """A row an error asked of ``auto``, in the least processor seconds of the repeats."""
     points = [
         dataclasses.replace(
             p, seconds=min(r.cpu_seconds for r in runs if (r.method, r.value) == (p.method, p.value))
@@ -63,8 +68,8 @@ def rows_of(name: str, grid: tuple[int, int], count: int, repeats: int, limit: f
     ]  # fmt: skip
     return [
         {
-            "scene": Path(name).stem, "points": len(problem.sensors.points), "asked": p.value, "made": p.error,
-            "stated": p.stated, "ms": 1e3 * p.seconds, "times_best": ratio,
+            "scene": Path(name).stem, **size, "asked": p.value, "made": p.error, "+-": p.doubt, "stated": p.stated,
+            "ms": 1e3 * p.seconds, "times_best": ratio,
             "best": min((q for q in points if q.kind == "ours" and q.error <= p.error), key=lambda q: q.seconds).method
             if ratio
             else "auto",
