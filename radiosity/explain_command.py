@@ -5,12 +5,17 @@ Only ``click`` is imported at the top; everything heavy is imported when the com
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 
 import click
 
 __all__ = ["explain"]
+
+
+def _percent(share: float) -> float | None:
+    return None if math.isnan(share) else 100.0 * share
 
 
 @click.command()
@@ -24,15 +29,32 @@ __all__ = ["explain"]
     help="Wanted error of the irradiance.",
 )
 @click.option("--repeats", type=click.IntRange(1, 100), default=3, show_default=True, metavar="N", help="Timed runs.")
+@click.option(
+    "--budget-seconds",
+    type=click.FloatRange(0, min_open=True),
+    default=40.0,
+    show_default=True,
+    metavar="S",
+    help="Processor time of the ablations, after the solve.",
+)
 @click.option("--seed", type=click.IntRange(0, 2**62), default=0, show_default=True, metavar="S", help="Of the rays.")
 @click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Threads.  [default: all cores]")
 @click.option("-o", "--output", "directory", type=click.Path(path_type=Path), metavar="DIR", help="Write files here.")
-def explain(scene: str, error: float, repeats: int, seed: int, workers: int | None, directory: Path | None) -> None:
+def explain(
+    scene: str,
+    error: float,
+    repeats: int,
+    budget_seconds: float,
+    seed: int,
+    workers: int | None,
+    directory: Path | None,
+) -> None:
     """Say how SCENE is solved to an error, and measure what each decision saves.
 
     Prints what the solver used and left out: meshes, surfaces not subdivided, lights found exactly or
     sampled, what the cullers set aside, rays.  Then the same work is done with each decision switched
-    off.  DIR gets explain.csv, explain.png and record.json.
+    off; what takes more than 20 times as long then is stopped, and what no time is left for is named.  DIR
+    gets explain.csv, explain.png and record.json.
     """
     from workbench.record import check_folder
 
@@ -47,7 +69,7 @@ def explain(scene: str, error: float, repeats: int, seed: int, workers: int | No
     for note in loaded.notes:
         click.echo(f"note: {note}", err=True)
     found = explanation.explain(
-        loaded, error=error, workers=workers, seed=seed, repeats=repeats,
+        loaded, error=error, workers=workers, seed=seed, repeats=repeats, budget_seconds=budget_seconds,
         report=lambda line: click.echo(line, err=True),
     )  # fmt: skip
     record = found.solution.record
@@ -58,8 +80,9 @@ def explain(scene: str, error: float, repeats: int, seed: int, workers: int | No
     rows = [
         {
             "part": item.part, "decision": item.decision, "without it": item.without,
-            "seconds": float(np.median(item.seconds)), "times": item.ratio, "from": min(item.ratios),
-            "to": max(item.ratios), "error_%": 100 * item.error, "without_%": 100 * item.error_without,
+            "seconds": float(np.median(item.seconds)), "times": item.ratio,
+            "stopped": "there" if item.stopped else "", "from": min(item.ratios),
+            "to": max(item.ratios), "error_%": _percent(item.error), "without_%": _percent(item.error_without),
         }
         for item in found.ablations
     ]  # fmt: skip

@@ -3,12 +3,18 @@
 Every saving is measured: the same question is asked again with one decision switched off, in interleaved
 rounds.  The answers are compared with a better one, so that what a decision costs in accuracy stands
 beside it.  A decision without which the same work is done, count by count, saves nothing here; it is
-told as such and not timed against itself.
+told as such and not timed against itself.  Processor time is bounded: work without a decision that takes
+more than :data:`STOP` times as long is stopped and told as such, and what no time is left for is named.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -23,11 +29,11 @@ from radiosity.sensors import Gatherer
 from radiosity.solvers.solution import Solution
 from radiosity.solvers.solve import _settings
 from workbench.counters import Counters
+from workbench.errors import WorkbenchError
 from workbench.geometry.flat import Geometry
 from workbench.scene.model import Scene
 from workbench.shadow.lights import lights_of_scene
 from workbench.shadow.occlusion import Shader
-from workbench.study.result import interleaved
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,6 +49,10 @@ POINTS = 512
 MOST_SAMPLES = 4096
 """Rays a point at which the search for as many as the error needs ends."""
 MOST_DOUBLINGS = 2
+STOP = 20.0
+"""Times as long as the work itself after which work without a decision is stopped."""
+BUDGET = 40.0
+"""Processor seconds of all ablations, unless asked otherwise."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +70,9 @@ class Ablation:
     seconds, seconds_without : tuple of float
         Of interleaved rounds, in their order.
     error, error_without : float
-        Relative, against a better answer.
+        Relative, against a better answer; nan where none is known.
+    stopped : bool
+        Whether the run without the decision was stopped: it takes longer than that.
     """
 
     part: str
@@ -72,6 +84,7 @@ class Ablation:
     seconds_without: tuple[float, ...]
     error: float
     error_without: float
+    stopped: bool = False
 
     @property
     def ratios(self) -> tuple[float, ...]:
@@ -98,21 +111,97 @@ def _did(counters: Mapping[str, int]) -> str:
     return ", ".join(f"{counters.get(name, 0):,} {name.replace('_', ' ')}" for name in names if counters.get(name, 0))
 
 
+class _Stopped(BaseException):
+    """Raised where the time of a run is up; as Ctrl-C, no handler of errors takes it."""
+
+
+@contextmanager
+def _at_most(seconds: float) -> Iterator[None]:
+    """Stop the block once it took that much processor time; in a thread other than the main one, never."""
+    if not math.isfinite(seconds) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    over = False
+
+    def stop(*_: object) -> None:
+        if not over:
+            raise _Stopped
+
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, max(seconds, 1e-3))
+    try:
+        yield
+    finally:
+        over = True
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
+
+
+class _Purse:
+    """Processor seconds that are left."""
+
+    def __init__(self, seconds: float) -> None:
+        self.end = time.process_time() + seconds
+
+    def left(self, share: float = 1.0) -> float:
+        """A share of what is left. [s]"""
+        return max(0.0, share * (self.end - time.process_time()))
+
+    def part(self, share: float) -> _Purse:
+        """A purse of a share of what is left."""
+        return _Purse(self.left(share))
+
+
 def _ablate(
     found: Explanation, part: str, words: Mapping[str, tuple[str, str]], base: str,
-    tasks: Mapping[str, Callable[[], _Outcome]], repeats: int, error: Callable[[FloatArray], float],
+    tasks: Mapping[str, Callable[[], _Outcome]], repeats: int, error: Callable[[FloatArray], float], purse: _Purse,
 ) -> None:  # fmt: skip
     """Run ``base`` and the task of each decision in interleaved rounds, and note what differs."""
-    asked = {name: tasks[name] for name in (base, *words)}
-    seconds, answers = interleaved(asked, repeats)
+
+    def timed(name: str, most: float = math.inf) -> tuple[float, float, _Outcome | None]:
+        start, used = time.perf_counter(), time.process_time()
+        try:
+            with _at_most(most):
+                answer: _Outcome | None = tasks[name]()
+        except _Stopped:
+            answer = None
+        return time.perf_counter() - start, time.process_time() - used, answer
+
+    first, cost, answer = timed(base)
+    assert answer is not None
+    wrong = error(answer.values)
+    seconds: dict[str, list[float]] = {base: [first]}
+    ended: dict[str, _Outcome] = {}
     for name, (decision, without) in words.items():
-        if answers[name].used == answers[base].used:
-            found.facts.append(f"{part}: {decision!r} changes nothing here: {without!r} is the same work")
+        if purse.left() <= cost:
+            found.facts.append(f"{part}: no time was left to do {without!r} in place of {decision!r}")
             continue
+        try:
+            took, used, other = timed(name, min(max(STOP * cost, 0.2), purse.left()))
+        except WorkbenchError as problem:
+            found.facts.append(f"{part}: {without!r} in place of {decision!r} is refused: {problem}")
+            continue
+        if other is None:
+            found.ablations.append(
+                Ablation(
+                    part, decision, without, answer.used, "stopped", (first,), (took,), wrong, math.nan, stopped=True
+                )
+            )
+        elif other.used == answer.used:
+            found.facts.append(f"{part}: {decision!r} changes nothing here: {without!r} is the same work")
+        else:
+            seconds[name], ended[name] = [took], other
+            cost += used
+    for turn in range(1, repeats):
+        if purse.left() < cost:
+            break
+        for name in list(seconds)[:: 1 if turn % 2 == 0 else -1]:
+            seconds[name].append(timed(name)[0])
+    for name, other in ended.items():
         found.ablations.append(
             Ablation(
-                part, decision, without, answers[base].used, answers[name].used, tuple(seconds[base]),
-                tuple(seconds[name]), error(answers[base].values), error(answers[name].values),
+                part, *words[name], answer.used, other.used, tuple(seconds[base]), tuple(seconds[name]), wrong,
+                error(other.values),
             )
         )  # fmt: skip
 
@@ -128,7 +217,7 @@ class Explanation:
 
 def explain(
     scene: Scene, *, error: float = 0.05, method: str = "auto", workers: int | None = None, seed: int = 0,
-    repeats: int = 3, report: Callable[[str], None] = lambda line: None,
+    repeats: int = 3, budget_seconds: float = BUDGET, report: Callable[[str], None] = lambda line: None,
 ) -> Explanation:  # fmt: skip
     """Solve a scene to an error, say how, and switch each decision off in turn.
 
@@ -140,7 +229,9 @@ def explain(
     workers : int, optional
     seed : int
     repeats : int
-        Runs of each ablation, interleaved.
+        Runs of each ablation, interleaved; fewer where the budget ends.
+    budget_seconds : float
+        Processor time of the ablations; the solve itself comes before.
     report : callable
         Called with a line before each part of the work.
 
@@ -154,14 +245,15 @@ def explain(
     found = Explanation(solution)
     geometry = Geometry.from_scene(scene)
     _mesh_facts(found, geometry, error)
-    if solution.record.settings["method"] != "matrix":  # whose decisions are told with the meshes
+    purse = _Purse(budget_seconds)
+    if solution.record.settings["method"] in ("progressive", "direct"):  # of others, told with the meshes
         report("finding form factors with decisions switched off ...")
-        _links(found, geometry, seed, repeats)
+        _links(found, geometry, seed, repeats, purse.part(0.4))
     report("finding shadows with decisions switched off ...")
     points = surface_points(solution.mesh, POINTS, seed=3)
-    _shadows(found, geometry, points, error, seed, repeats, workers)
+    _shadows(found, geometry, points, error, seed, repeats, workers, purse.part(0.4))
     report("solving other meshes ...")
-    _meshes(found, points, error, seed, workers, repeats)
+    _meshes(found, points, error, seed, workers, repeats, purse)
     return found
 
 
@@ -215,7 +307,7 @@ def _listed(names: Sequence[str]) -> str:
 # ---- form factors -----------------------------------------------------------------------------------
 
 
-def _links(found: Explanation, geometry: Geometry, seed: int, repeats: int) -> None:
+def _links(found: Explanation, geometry: Geometry, seed: int, repeats: int, purse: _Purse) -> None:
     """Form factors to some patches: the brightest ones and an even choice of the rest."""
     mesh, record = found.solution.mesh, found.solution.record
     power = np.add.reduceat((mesh.emission * mesh.element_area[:, None]).sum(axis=1), mesh.patch_start[:-1])
@@ -242,11 +334,14 @@ def _links(found: Explanation, geometry: Geometry, seed: int, repeats: int) -> N
         "floor": replace(used, floor=1e-9),
         "error": _settings(min(asked / 10, 1e-3), rays, seed, mesh.patch_count),
     }
-    better = columns(replace(_settings(min(asked / 30, 3e-4), rays * 16, seed + 1, mesh.patch_count))).values
     columns(used)
-    where = better > 0
+    fine = _settings(min(asked / 30, 3e-4), rays * 16, seed + 1, mesh.patch_count)
+    better = _better(found, "form factors", [partial(columns, fine)], purse)
 
     def error(values: FloatArray) -> float:
+        if better is None:
+            return math.nan
+        where = better > 0
         return relative_rms(values[where][:, None], better[where][:, None])[0]
 
     words = {
@@ -259,7 +354,19 @@ def _links(found: Explanation, geometry: Geometry, seed: int, repeats: int) -> N
         "error": (f"form factors to {asked:g}, as the error needs", f"form factors to {min(asked / 10, 1e-3):g}"),
     }
     tasks = {name: partial(columns, settings) for name, settings in variants.items()}
-    _ablate(found, "form factors", words, "used", tasks, repeats, error)
+    _ablate(found, "form factors", words, "used", tasks, repeats, error, purse)
+
+
+def _better(found: Explanation, part: str, tasks: Sequence[Callable[[], _Outcome]], purse: _Purse) -> FloatArray | None:
+    """The first of some answers, best first, that takes less than a third of the time."""
+    for task in tasks:
+        try:
+            with _at_most(purse.left(0.35)):
+                return task().values
+        except (_Stopped, WorkbenchError):
+            continue
+    found.facts.append(f"{part}: a better answer takes too long here; errors are not told")
+    return None
 
 
 # ---- shadows ----------------------------------------------------------------------------------------
@@ -267,7 +374,7 @@ def _links(found: Explanation, geometry: Geometry, seed: int, repeats: int) -> N
 
 def _shadows(
     found: Explanation, geometry: Geometry, where: tuple[Any, Any, Any], error: float, seed: int, repeats: int,
-    workers: int | None,
+    workers: int | None, purse: _Purse,
 ) -> None:  # fmt: skip
     """Direct light at points: automatic, and with cullers, exact cuts or the smooth fit switched off."""
     scene = found.solution.scene
@@ -283,7 +390,16 @@ def _shadows(
             points, normals, lights, method, error=error, samples=samples, seed=seed, own_polygon=own
         )  # fmt: skip
 
-    exact = ask("exact").irradiance
+    exact = None
+    while exact is None:
+        try:
+            with _at_most(purse.left(0.3)):
+                exact = ask("exact").irradiance
+        except _Stopped:
+            if len(points) <= POINTS // 16:
+                found.facts.append("shadows: exact cuts take too long here; nothing is told of them")
+                return
+            points, normals, own = points[::4], normals[::4], own[::4]
     if not exact.any():
         found.facts.append("lights: none reaches a surface directly")
         return
@@ -306,8 +422,12 @@ def _shadows(
     needed: dict[str, int] = {}
     for method in ("rays", "shaft"):
         samples = 4
-        while samples < MOST_SAMPLES and off(ask(method, samples)) > goal:
-            samples *= 2
+        try:
+            with _at_most(purse.left(0.2)):
+                while samples < MOST_SAMPLES and off(ask(method, samples)) > goal:
+                    samples *= 2
+        except _Stopped:
+            pass  # with so many it takes long enough to tell
         needed[method] = samples
         tasks[method] = partial(outcome, method, samples)
     words = {
@@ -318,7 +438,7 @@ def _shadows(
         ),
         "exact": ("rays where candidates are many", "exact cuts everywhere"),
     }
-    _ablate(found, "shadows", words, "auto", tasks, repeats, lambda values: relative_rms(values, exact)[0])
+    _ablate(found, "shadows", words, "auto", tasks, repeats, lambda values: relative_rms(values, exact)[0], purse)
 
 
 def _light_facts(found: Explanation, lights: Sequence[Any], estimate: Any) -> None:
@@ -343,7 +463,8 @@ def _light_facts(found: Explanation, lights: Sequence[Any], estimate: Any) -> No
 
 
 def _meshes(
-    found: Explanation, where: tuple[Any, Any, Any], error: float, seed: int, workers: int | None, repeats: int
+    found: Explanation, where: tuple[Any, Any, Any], error: float, seed: int, workers: int | None, repeats: int,
+    purse: _Purse,
 ) -> None:  # fmt: skip
     """A solve of that many elements and a gather from it, whole, with decisions switched off."""
     from radiosity.element_lookup import ElementLookup
@@ -381,17 +502,22 @@ def _meshes(
         element = lookup.elements(points[flat], polygons[flat], np.ones(int(flat.sum()), dtype=bool))
         return _Outcome(solution.element_irradiance[element], said(solution, solution.record.counters, "read off"))
 
-    better = gathered(4 * count, form_factor_error=asked / 10).values
+    finer = [partial(gathered, many * count, form_factor_error=asked / 10) for many in (4, 2)]
+    better = _better(found, "mesh", finer, purse)
 
     def off(values: FloatArray) -> float:
-        return relative_rms(values, better)[0]
+        return relative_rms(values, better)[0] if better is not None else math.nan
 
-    goal = max(error, off(gathered().values))
     elements = count
-    for _ in range(MOST_DOUBLINGS):
-        if off(read(elements).values) <= goal:
-            break
-        elements *= 2
+    try:
+        with _at_most(purse.left(0.3)):
+            goal = max(error, off(gathered().values)) if better is not None else math.inf
+            for _ in range(MOST_DOUBLINGS):
+                if off(read(elements).values) <= goal:
+                    break
+                elements *= 2
+    except _Stopped:
+        pass  # of so many it takes long enough to tell
     tasks: dict[str, Callable[[], _Outcome]] = {
         "used": gathered, "finer": partial(gathered, 2 * count), "read": partial(read, elements),
     }  # fmt: skip
@@ -399,7 +525,12 @@ def _meshes(
         "finer": (f"about {count:,} elements are enough", f"about {2 * count:,} elements"),
         "read": ("direct light is found at the point", f"read off about {elements:,} elements"),
     }
-    _ablate(found, "mesh", words, "used", tasks, repeats, off)
+    rest = purse.part(0.5)
+    _ablate(found, "mesh", words, "used", tasks, repeats, off, rest)
+    if method == "hierarchical":
+        tasks["columns"] = partial(gathered, method="progressive", form_factor_error=min(2.0 * error, 0.02))
+        words = {"columns": ("links, as coarse as the error allows", "column by column, from each receiver")}
+        _ablate(found, "form factors", words, "used", tasks, repeats, off, purse)
     if method == "matrix":
         tasks["columns"] = partial(gathered, method="progressive", form_factor_error=min(2.0 * error, 0.02))
         tasks["better"] = partial(gathered, form_factor_error=asked / 10)
@@ -407,7 +538,7 @@ def _meshes(
             "columns": ("all form factors at once, pairs settled in groups", "column by column, from each receiver"),
             "better": (f"form factors to {asked:g}, as the error needs", f"form factors to {asked / 10:g}"),
         }
-        _ablate(found, "form factors", words, "used", tasks, repeats, off)
+        _ablate(found, "form factors", words, "used", tasks, repeats, off, purse)
 
 
 # ---- the figure -------------------------------------------------------------------------------------
@@ -421,7 +552,11 @@ def draw_ablations(figure: Figure, ablations: Sequence[Ablation], title: str) ->
     ordered = sorted(ablations, key=lambda item: (list(colours).index(item.part), -item.ratio))
     place = np.arange(len(ordered))
     ratios = [item.ratio for item in ordered]
-    axes.barh(place, [r - 1.0 for r in ratios], left=1.0, color=[colours[item.part] for item in ordered], height=0.6)
+    bars = axes.barh(
+        place, [r - 1.0 for r in ratios], left=1.0, color=[colours[item.part] for item in ordered], height=0.6
+    )
+    for bar, item in zip(bars, ordered, strict=True):
+        bar.set(hatch="///" if item.stopped else None, edgecolor="white")
     axes.axvline(1.0, color="0.3", lw=0.8)
     axes.set_xscale("log")
     spread = [r for item in ordered for r in item.ratios]
@@ -430,8 +565,11 @@ def draw_ablations(figure: Figure, ablations: Sequence[Ablation], title: str) ->
     for row, item in enumerate(ordered):
         least, most = min(item.ratios), max(item.ratios)
         axes.plot([least, most], [row, row], color="0.2", lw=1.2, marker="|", ms=6)
-        change = f"error {item.error:.2%} -> {item.error_without:.2%}"
-        text = f"x {item.ratio:.2g} ({least:.2g} to {most:.2g});  {change}"
+        text = f"more than x {item.ratio:.2g}: stopped" if item.stopped else f"x {item.ratio:.2g}"
+        if len(item.ratios) > 1:
+            text += f" ({least:.2g} to {most:.2g})"
+        if math.isfinite(item.error_without):
+            text += f";  error {item.error:.2%} -> {item.error_without:.2%}"
         axes.text(max(most, 1.0) * 1.08, row, text, va="center", fontsize=8)
     axes.set_yticks(place, [f"{item.decision}\nwithout: {item.without}" for item in ordered], fontsize=8)
     axes.invert_yaxis()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -9,9 +11,9 @@ from matplotlib.figure import Figure
 
 from radiosity.cli import main
 from radiosity.report.cost_model import TABLE, CostModel, fit, read_table, write_table
-from radiosity.report.explanation import draw_ablations, explain
+from radiosity.report.explanation import Explanation, _ablate, _Outcome, _Purse, draw_ablations, explain
 from radiosity.report.speed_accuracy import Run
-from workbench.errors import InputError
+from workbench.errors import InputError, OptionError
 from workbench.scene.load import load
 
 
@@ -88,6 +90,41 @@ def test_a_solve_is_explained(method, dear):
     draw_ablations(figure, found.ablations, "t")
     figure.savefig("/dev/null", format="png")
     assert len(figure.axes[0].get_yticklabels()) == len(found.ablations)
+
+
+def test_dear_work_is_stopped_and_told():
+    """Of tasks that take 0.01, 0.03 and endless processor seconds, and one that is refused."""
+
+    def work(seconds, used):
+        end = time.process_time() + seconds
+        while time.process_time() < end:
+            sum(range(1000))
+        return _Outcome(np.array([[used]]), f"{used}")
+
+    def refused():
+        raise OptionError("too much")
+
+    tasks = {"base": lambda: work(0.01, 1), "slow": lambda: work(0.03, 2), "same": lambda: work(0.01, 1),
+             "endless": lambda: work(60.0, 3), "refused": refused}  # fmt: skip
+    words = {name: (f"not {name}", name) for name in ("slow", "same", "endless", "refused")}
+    found = Explanation(None)
+    _ablate(found, "mesh", words, "base", tasks, 3, lambda values: float(values[0, 0]) / 100, _Purse(5.0))
+    by_name = {item.without: item for item in found.ablations}
+    assert set(by_name) == {"slow", "endless"}
+    assert len(by_name["slow"].ratios) == 3 and 1.5 < by_name["slow"].ratio < 8.0 and not by_name["slow"].stopped
+    assert by_name["endless"].stopped and by_name["endless"].ratio > 5.0 and np.isnan(by_name["endless"].error_without)
+    assert "same work" in found.facts[0] and "too much" in found.facts[1]
+    figure = Figure(layout="constrained")
+    draw_ablations(figure, found.ablations, "t")
+    assert any("stopped" in text.get_text() for text in figure.axes[0].texts)
+    empty = Explanation(None)
+    _ablate(empty, "mesh", words, "base", tasks, 3, lambda values: 0.0, _Purse(0.0))
+    assert not empty.ablations and len(empty.facts) == 4 and "no time was left" in empty.facts[0]
+
+
+def test_a_solve_by_links_is_explained():
+    found = explain(load("l-room"), error=0.2, method="hierarchical", repeats=1)
+    assert "column by column, from each receiver" in {item.without for item in found.ablations}
 
 
 def test_bad_input_of_the_command(tmp_path):
