@@ -561,11 +561,11 @@ def draw_ablations(figure: Figure, ablations: Sequence[Ablation], title: str) ->
     axes.set_xscale("log")
     spread = [r for item in ordered for r in item.ratios]
     low, high = min(0.5, *spread), max(2.0, *spread)
-    axes.set_xlim(low / 1.6, high * 20.0)
+    axes.set_xlim(low / 1.6, high * 40.0)
     for row, item in enumerate(ordered):
         least, most = min(item.ratios), max(item.ratios)
         axes.plot([least, most], [row, row], color="0.2", lw=1.2, marker="|", ms=6)
-        text = f"more than x {item.ratio:.2g}: stopped" if item.stopped else f"x {item.ratio:.2g}"
+        text = f"more than x {item.ratio:,.0f}: stopped" if item.stopped else f"x {item.ratio:.2g}"
         if len(item.ratios) > 1:
             text += f" ({least:.2g} to {most:.2g})"
         if math.isfinite(item.error_without):
