@@ -1,7 +1,8 @@
 """PLY files (G. Turk, "The PLY Polygon File Format", Stanford 1994) with their polygons whole.
 
 trimesh cuts polygons into fans, which is wrong for concave ones, and cannot read binary files that mix triangles with
-quads.
+quads; meshio refuses edges, lists of texture coordinates and most names of types; plyfile is under the GPL, which this
+project is not.
 """
 
 from __future__ import annotations
