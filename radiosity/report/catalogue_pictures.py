@@ -159,6 +159,12 @@ def _pictures(
     return Failure(name, group, about, expected, tolerance, made, disclaimed or {})
 
 
+def _penumbra(end: float, x: float, y: float) -> float:
+    """Irradiance from the part with x from -1/2 to ``end`` of a unit square of radiance 1 at height 2."""
+    ring = [[-0.5, 0.5, 2], [end, 0.5, 2], [end, -0.5, 2], [-0.5, -0.5, 2]]
+    return point_irradiance(ring, [x, y, 0.0])
+
+
 def picture_entries() -> list[Failure]:
     """One number of a small picture."""
     eye = Camera(np.array([0.05, 0.02, 2.0]), np.array([0.05, 0.02, 0.0]), np.array([0.0, 1.0, 0.0]), 40.0, 16, 16)
@@ -192,6 +198,32 @@ def picture_entries() -> list[Failure]:
     outside = box_surface("outside", diffuse("outside", 0.5), [0, 0, 0], [1, 1, 1], inward=True)
     shell = box_surface("shell", diffuse("shell", 0.5), [0.39, 0.39, 0.39], [0.61, 0.61, 0.61])
     boxes = Scene("box in a box", (inside, outside, shell), camera=corner, background=np.zeros(1), bands=1, closed=True)
+    # Under a black half-plane: at x the part of the lamp with x' < -x is seen.
+    under = Camera(np.array([0.0, 0.0, 0.9]), np.array([0.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 50.0, 12, 12)
+    lamp = _flat("lamp", 0.0, [[-0.5, 0.5, 2], [0.5, 0.5, 2], [0.5, -0.5, 2], [-0.5, -0.5, 2]], math.pi)
+    half_plane = _flat("half-plane", 0.0, [[0, -9, 1], [9, -9, 1], [9, 9, 1], [0, 9, 1]])
+    soft = Scene("penumbra", (lamp, half_plane, ground), camera=under, background=np.zeros(1), bands=1)
+    reach = 0.9 * math.tan(math.radians(25.0))
+    parts = ((np.arange(48) + 0.5) / 24.0 - 1.0) * reach
+    seen_to = np.clip(-parts, -0.5 + 1e-9, 0.5)
+    fine = np.array([[_penumbra(end, x, y) for x, end in zip(parts, seen_to, strict=True)] for y in -parts])
+    penumbra = 0.5 / math.pi * fine.reshape(12, 4, 12, 4).mean(axis=(1, 3))
+
+    panes = [replace(diffuse(f"pane {tau}", 0.0), transmittance=np.array([tau])) for tau in (0.5, 0.8)]
+    sides = ([[-9, -9, 1], [0, -9, 1], [0, 9, 1], [-9, 9, 1]], [[0, -9, 1], [9, -9, 1], [9, 9, 1], [0, 9, 1]])
+    tinted = replace(black, camera=under, surfaces=(ground, *(
+        Surface.from_polygons(pane.name, pane, [np.asarray(ring, dtype=float)])
+        for pane, ring in zip(panes, sides, strict=True)
+    )))  # fmt: skip
+    tints = np.repeat([[0.5, 0.8]], 6, axis=1)
+    aside = np.abs(np.arange(12) - 5.5) > 1.0  # of the edge between them
+
+    # The raised square is of the ground's own surface; slanting light takes its shadow 0.4 aside.
+    sheet = Surface.from_polygons("sheet", diffuse("sheet", 0.5), [ground.vertices, square.vertices])
+    slanted = replace(noon, direction=np.array([0.4, 0.0, -0.5]) / math.hypot(0.4, 0.5))
+    fold = replace(black, surfaces=(sheet,), lights=(slanted,))
+    dark = (0.7 - (0.05 + 0.25 * 2.0 / 1.5)) * 0.6  # what the square itself leaves to be seen of it
+    folded = 0.5 / math.hypot(0.4, 0.5) * (1.0 - dark / seen**2)
     gathers = ("gathered picture", "mitsuba")
     near = (*gathers, "radiance")
     return [
@@ -202,6 +234,14 @@ def picture_entries() -> list[Failure]:
                   1.0 - 0.25 / 64, lambda picture: float(picture.mean()), (*PICTURES, "mitsuba", "radiance"), 0.001,
                   {"aliased picture": "one sample a pixel"} | dict.fromkeys(
                       ("adaptive picture", "atomic picture"), "a feature between agreeing corners is not known")),
+        _pictures("a fold in one surface", "silhouettes", "corners on one and the same surface are taken for one plane",
+                  fold, folded, lambda picture: float(picture.mean()), (*PICTURES, "mitsuba", "radiance"),
+                  0.003, {"aliased picture": "one sample a pixel: edges are steps"}),
+        _pictures("a penumbra", "silhouettes", "corners in part lit are believed to agree: rms of all pixels", soft,
+                  0.0, lambda picture: float(np.sqrt(((picture - penumbra) ** 2).mean()) / penumbra.mean()), PICTURES,
+                  0.02),
+        _pictures("panes of two strengths", "union, not product", "equal states, but not equal light", tinted, 0.0,
+                  lambda picture: float(np.abs(picture - tints)[:, aside].max()), PICTURES, 0.005),
         _pictures("a floor before a lit wall", "fireflies", "single pixels far too bright where rays hit the wall near",
                   bright, 1.0, lambda picture: float((picture / truth).max()), near, 0.03),
         _pictures("dark spots before a lit wall", "fireflies", "single pixels that no ray to the wall lights", bright,
