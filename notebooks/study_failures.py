@@ -25,7 +25,7 @@ chosen = [
 matrix = run_catalogue(chosen)
 
 # %%
-draw_matrix(plt.figure(layout="constrained"), chosen, matrix)
+draw_matrix(plt.figure(), chosen, matrix)
 plt.show()
 
 # %% [markdown]

@@ -19,6 +19,7 @@ from workbench.errors import InputError, OptionError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from radiosity.report.failures import Cell, Failure
@@ -133,17 +134,6 @@ def _text(cell: Cell | None) -> str:
     return {"degrades": f"degrades {error}", "disclaims": f"disclaims {error}"}.get(cell.verdict, f"WRONG {error}")
 
 
-def _columns(chosen: Sequence[tuple[Failure, Sequence[str]]]) -> list[str]:
-    """Techniques, those that answer the same questions side by side."""
-    from radiosity.rivals import RIVALS
-
-    families: dict[tuple[str, ...], None] = dict.fromkeys(tuple(entry.techniques) for entry, _ in chosen)
-    asked = {technique for _, techniques in chosen for technique in techniques}
-    ordered = sorted(families, key=len, reverse=True)
-    names = [name for name in dict.fromkeys(n for family in ordered for n in family) if name in asked]
-    return sorted(names, key=lambda name: name in RIVALS)  # which answer questions of all kinds: at the end
-
-
 def _rows(
     chosen: Sequence[tuple[Failure, Sequence[str]]], matrix: Mapping[tuple[str, str], Cell]
 ) -> list[dict[str, str]]:
@@ -200,7 +190,7 @@ def _write(
     writer = csv.DictWriter(table, list(cells[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(cells)
-    figure = Figure(layout="constrained")
+    figure = Figure()
     FigureCanvasAgg(figure)
     draw_matrix(figure, chosen, matrix)
     try:
@@ -216,19 +206,80 @@ def _write(
         click.echo(str(directory / name))
 
 
+def _families(
+    chosen: Sequence[tuple[Failure, Sequence[str]]],
+) -> list[tuple[list[str], list[tuple[Failure, Sequence[str]]]]]:
+    """Techniques that answer the same questions, rivals last, and the entries that they answer."""
+    from radiosity.rivals import RIVALS
+
+    found: list[tuple[list[str], list[tuple[Failure, Sequence[str]]]]] = []
+    for entry, techniques in chosen:
+        own = [name for name in techniques if name not in RIVALS]
+        joined = [family for family in found if set(family[0]) & set(own)]
+        names = list(dict.fromkeys([*(name for family in joined for name in family[0]), *own]))
+        entries = [item for family in joined for item in family[1]] + [(entry, techniques)]
+        place = found.index(joined[0]) if joined else len(found)
+        found = [family for family in found if family not in joined]
+        found.insert(place, (names, entries))
+    order = [entry.name for entry, _ in chosen]
+    return [
+        (
+            names + [rival for rival in RIVALS if any(rival in techniques for _, techniques in entries)],
+            sorted(entries, key=lambda item: order.index(item[0].name)),
+        )
+        for names, entries in found
+    ]
+
+
+ROW, COLUMN, LABELS, GROUPS, HEAD = 0.19, 0.42, 2.95, 1.75, 1.05
+"""Inches of the figure: a row, a column, the names of failures, those of groups, and of techniques above a panel."""
+
+
 def draw_matrix(
     figure: Figure, chosen: Sequence[tuple[Failure, Sequence[str]]], matrix: Mapping[tuple[str, str], Cell]
 ) -> None:
-    """Failures down, techniques across, a coloured cell for each pair, into an empty figure."""
-    from matplotlib.patches import Patch, Rectangle
+    """Failures down, techniques across, a coloured cell for each pair, into an empty figure.
+
+    A panel for the techniques that answer the same questions, one below the other.
+    """
+    from matplotlib.patches import Patch
+
+    families = _families(chosen)
+    width = LABELS + GROUPS + COLUMN * max(len(names) for names, _ in families)
+    height = 0.9 + sum(HEAD + ROW * len(entries) for _, entries in families)
+    figure.set_size_inches(width, height)
+    top = height - 0.3
+    for names, entries in families:
+        top -= HEAD
+        size = (COLUMN * len(names), ROW * len(entries))
+        axes = figure.add_axes((LABELS / width, (top - size[1]) / height, size[0] / width, size[1] / height))
+        _draw_panel(axes, names, entries, matrix)
+        top -= size[1]
+    ours, theirs = (counts["wrong"] for counts in _counts(matrix))
+    words = {
+        "right": "right", "degrades": "degrades, and says so: error", "refuses": "refuses, with a reason",
+        "disclaims": "disclaimed in its documentation: error",
+        "wrong": f"wrong silently (ours {ours}, rivals {theirs})",
+    }  # fmt: skip
+    figure.legend(
+        handles=[Patch(facecolor=VERDICTS[verdict], label=text) for verdict, text in words.items()],
+        loc="lower left", bbox_to_anchor=(0.1 / width, 0.05 / height), ncols=3, fontsize=9, frameon=False,
+    )  # fmt: skip
+    figure.suptitle(
+        "Where techniques of light transport fail, and what became of each", fontsize=11, y=1.0 - 0.1 / height
+    )
+
+
+def _draw_panel(
+    axes: Axes, columns: list[str], entries: Sequence[tuple[Failure, Sequence[str]]],
+    matrix: Mapping[tuple[str, str], Cell],
+) -> None:  # fmt: skip
+    from matplotlib.patches import Rectangle
 
     from radiosity.rivals import RIVALS
 
-    columns = _columns(chosen)
-    figure.set_size_inches(max(4.6 + 0.62 * len(columns), 9.5), 2.6 + 0.27 * len(chosen))
-    axes = figure.subplots()
     before = None
-    for row, (entry, techniques) in enumerate(chosen):
+    for row, (entry, techniques) in enumerate(entries):
         if entry.group != before:
             axes.axhline(row, color="0.35", lw=0.8)
             axes.text(len(columns) + 0.15, row + 0.5, entry.group, va="center", fontsize=8, color="0.3", style="italic")
@@ -245,22 +296,11 @@ def draw_matrix(
     rivals = sum(name in RIVALS for name in columns)
     if 0 < rivals < len(columns):
         axes.axvline(len(columns) - rivals, color="0.35", lw=1.2)
-        axes.text(len(columns) - 0.5 * rivals, len(chosen) + 0.2, "rivals", ha="center", va="top", fontsize=8)
     axes.set_xlim(0, len(columns))
-    axes.set_ylim(len(chosen), 0)
-    axes.set_yticks([row + 0.5 for row in range(len(chosen))], [entry.name for entry, _ in chosen], fontsize=8)
-    axes.set_xticks([i + 0.5 for i in range(len(columns))], columns, rotation=50, ha="left", fontsize=8)
-    axes.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
+    axes.set_ylim(len(entries), 0)
+    axes.set_yticks([row + 0.5 for row in range(len(entries))], [entry.name for entry, _ in entries], fontsize=8)
+    told = [f"{name} (rival)" if name in RIVALS else name for name in columns]
+    axes.set_xticks([i + 0.5 for i in range(len(columns))], told, rotation=45, ha="left", rotation_mode="anchor")
+    axes.tick_params(length=0, top=False, labeltop=True, labelbottom=False, pad=2, labelsize=8)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    ours, theirs = (counts["wrong"] for counts in _counts(matrix))
-    words = {
-        "right": "right", "degrades": "degrades, and says so: error", "refuses": "refuses, with a reason",
-        "disclaims": "disclaimed in its documentation: error",
-        "wrong": f"wrong silently (ours {ours}, rivals {theirs})",
-    }  # fmt: skip
-    axes.legend(
-        handles=[Patch(facecolor=VERDICTS[verdict], label=text) for verdict, text in words.items()],
-        loc="upper left", bbox_to_anchor=(0.0, -0.01), ncols=3, fontsize=8, frameon=False,
-    )  # fmt: skip
-    figure.suptitle("Where techniques of light transport fail, and what became of each", fontsize=11)
