@@ -78,8 +78,9 @@ POOL = 4.0
 """Rays for which the mean spread of all pixels counts in that of one."""
 DIRECT_SHARE = 4
 """Of so many rays in a subdivided pixel one is a place at which direct light is found; all where that has an edge."""
-SPACING = 0.5
-"""Nodes stand no further apart than this share of the harmonic mean distance to what lights them."""
+SPACING, SPACED_FOR = 0.5, 0.02
+"""Nodes stand no further apart than this share of the harmonic mean distance to what lights them, for this error or a
+smaller one; as the root of the error beyond, for interpolation errs as the square of the step."""
 PILOT_RAYS = (16, 128)
 """Rays of a bundle before it is known how many are needed: as many as 0.03 of error needs, within these."""
 NODE_ERROR = 1.5
@@ -1006,7 +1007,8 @@ class _Tile:
                 total = np.concatenate([whole, whole + found[:, self.owner.bands :]], axis=1)
                 off = np.abs(np.where(np.isfinite(foretold), foretold, found) - found) - NOISE * spread
                 uneven = (off > self.options.error * total).any(axis=1)
-                close = pitch * fragments.footprint[rows] > SPACING * distance
+                spacing = SPACING * math.sqrt(max(self.options.error / SPACED_FOR, 1.0))
+                close = pitch * fragments.footprint[rows] > spacing * distance
                 flagged = cell[rows[uneven | close]]
                 sharp: NDArray[np.bool_] = np.logical_and(uneven, pitch == 1)
                 nodes.add(everywhere[rows], found, sharp)

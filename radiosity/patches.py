@@ -201,6 +201,8 @@ def _quad_counts(quad: FloatArray, edge: float, split: int) -> tuple[int, int]:
 
 def _mesh_quad(quad: FloatArray, edge: float, split: int) -> _Part:
     nu, nv = _quad_counts(quad, edge, split)
+    if nu == nv == 1:
+        return _Part([[quad]], [0], [[quad]])
     pu, pv = max(1, nu // split), max(1, nv // split)
     cells = _quad_cells(quad, nu, nv)
     coarse = _quad_cells(quad, pu, pv)

@@ -63,6 +63,8 @@ DIRECT_SHARE = 0.5
 """Share of the wanted error that sampled direct light may take."""
 COARSE = 0.5
 """Distance, in diameters of an element, below which rays that hit it may need more than the mesh knows."""
+ROUGH, ROUGH_SHARE = 0.05, 0.5
+"""Error from which this share of that distance will do."""
 DEEP_HITS, DEEP_FOR, MOST_DEEP = 4, 600, 256
 """Such hits of a run whose light is gathered again, instead of read from the mesh, in bundles of 600 rays; their number
 grows with the power 3/2 of the rays, as the variance falls.  And the most of them."""
@@ -378,7 +380,7 @@ class Gatherer(DirectLight):
         shape = (len(points), self.reflected.shape[1])
         if not self.reflected.any() and self.sky is None:
             return Bundled(np.zeros(shape), np.zeros(shape), np.full(len(points), math.inf), np.zeros(shape))
-        bundle = self._empty_bundle(points, normals, np.ones(len(points), dtype=bool))
+        bundle = self._empty_bundle(points, normals, np.ones(len(points), dtype=bool), error)
         self._extend(bundle, np.full(len(points), max(_power_of_two(rays), 2 * RUNS)), counters)
         mean, spread, sky = bundle.result()
         if error is not None and direct is not None:
@@ -407,16 +409,16 @@ class Gatherer(DirectLight):
         nothing = np.zeros((n, bands))
         if not self.reflected.any() and not crowded.any():
             return Bundled(nothing, nothing.copy(), np.full(n, math.inf), nothing), "none"
-        bundle = self._empty_bundle(points, normals, crowded)
+        bundle = self._empty_bundle(points, normals, crowded, error)
         if rays is not None:
             self._extend(bundle, np.full(n, max(_power_of_two(rays), 2 * RUNS)), counters)
             return bundle.found(), "rays"
         who = np.full(n, -1, dtype=np.int64) if own is None else np.broadcast_to(np.asarray(own, np.int64), (n,))
         # Closed forms know no candidates yet: what they cost at least.
         least = math.inf
-        lit: NDArray[np.bool_] = np.asarray(self.reflected.any(axis=1))
-        if not crowded.any() and np.count_nonzero(lit[self.lookup.piece_element]) <= MOST_PIECES:
-            least = GROUP_COST * self._exact.groups + COSTS[CLOSED] * self._exact.pieces
+        groups, pieces = self._sending
+        if not crowded.any() and pieces <= MOST_PIECES:
+            least = GROUP_COST * groups + COSTS[CLOSED] * pieces
         pilot = _power_of_two(round(PILOT_RAYS[1] * (PILOT_ERROR / error) ** (4.0 / 3.0)))
         pilot = min(max(pilot, PILOT_RAYS[0]), PILOT_RAYS[1])
         closed = least <= pilot
@@ -462,7 +464,10 @@ class Gatherer(DirectLight):
             target = allotted(unsure**2, bundle.count, allowed)
         return Bundled(value + fix, doubt + unsure, bundle.distance(), np.zeros_like(value))
 
-    def _empty_bundle(self, points: FloatArray, normals: FloatArray, crowded: NDArray[np.bool_]) -> _Bundle:
+    def _empty_bundle(
+        self, points: FloatArray, normals: FloatArray, crowded: NDArray[np.bool_], error: float | None = None
+    ) -> _Bundle:
+        reach = ROUGH_SHARE if error is not None and error >= ROUGH else 1.0
         n, bands = len(points), self.reflected.shape[1]
         return _Bundle(
             points,
@@ -475,8 +480,15 @@ class Gatherer(DirectLight):
             np.zeros(n, dtype=np.int64),
             self.sky if crowded.any() else None,
             crowded,
-            bool(self._coarse.any()),
+            reach if self._coarse.any() else 0.0,
         )
+
+    @cached_property
+    def _sending(self) -> tuple[int, int]:
+        """Numbers of sides of polygons, and of pieces of elements on them, that send light."""
+        lit: NDArray[np.bool_] = np.asarray(self.reflected.any(axis=1))
+        pieces = np.flatnonzero(lit[self.lookup.piece_element])
+        return len(np.unique(_side_keys(self.solution.mesh, self.lookup, pieces))), len(pieces)
 
     @cached_property
     def _exact(self) -> _Groups:
@@ -548,7 +560,7 @@ class Gatherer(DirectLight):
         centre, scale = tracer.frame
         law = bundle.sky.law if bundle.sky is not None else np.zeros(12)
         bits = net_bits(max(count for *_, count in blocks))
-        coarse = self._coarse if bundle.deep else np.zeros(mesh.element_count)
+        coarse = bundle.deep * self._coarse if bundle.deep else np.zeros(mesh.element_count)
 
         def work(task: tuple[IntArray, int, int]) -> tuple[int, int, _Close]:
             block, first, count = task
@@ -618,7 +630,7 @@ class Gatherer(DirectLight):
         normal = self.geometry.polygon_normal[polygon] * np.where(behind, -1.0, 1.0)[:, None]
         lit = self.direct(place, normal, own_polygon=polygon, error=DEEP_ERROR, counters=counters)
         small = self._empty_bundle(place, normal, lit.crowded)
-        small.deep = False
+        small.deep = 0.0
         self._extend(small, np.full(len(place), DEEP_RAYS), counters)
         indirect, _, from_sky = small.result()
         # What the mesh holds beside reflected light stays: the emission of lamps with too many facets.
@@ -667,7 +679,10 @@ def allotted(variance: FloatArray, count: IntArray, allowed: FloatArray, most: i
 
 @dataclass
 class _Bundle:
-    """Bundles of n points and what their rays found so far."""
+    """Bundles of n points and what their rays found so far.
+
+    Light is gathered again at hits within ``deep`` times the distance for which the mesh is too coarse; 0: never.
+    """
 
     points: FloatArray
     normals: FloatArray
@@ -679,7 +694,7 @@ class _Bundle:
     close: IntArray
     sky: SkyLight | None
     crowded: NDArray[np.bool_]
-    deep: bool
+    deep: float
 
     def result(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean of each bundle, the standard error from the spread of the runs, and the sky seen where it is asked.
@@ -721,6 +736,11 @@ class _Bundle:
         return np.where(inverse > 0, hits / np.where(inverse > 0, inverse, 1.0), math.inf)
 
 
+def _side_keys(mesh: PatchMesh, lookup: ElementLookup, pieces: IntArray) -> IntArray:
+    """Number (n,) of the side of a polygon that each of some pieces lies on."""
+    return lookup.piece_polygon[pieces] * 2 + (mesh.element_side[mesh.piece_element[pieces]] < 0)
+
+
 @dataclass(frozen=True)
 class _Groups:
     """Pieces of elements that send light, by side of a polygon.
@@ -747,7 +767,7 @@ class _Groups:
     def build(cls, mesh: PatchMesh, lookup: ElementLookup, values: FloatArray) -> _Groups:
         lit: NDArray[np.bool_] = np.asarray(values.any(axis=1))
         pieces = np.flatnonzero(lit[mesh.piece_element])
-        key = lookup.piece_polygon[pieces] * 2 + (mesh.element_side[mesh.piece_element[pieces]] < 0)
+        key = _side_keys(mesh, lookup, pieces)
         order = np.argsort(key, kind="stable")
         members = pieces[order]
         groups, first = np.unique(key[order], return_index=True)
