@@ -7,6 +7,7 @@ that know triangles only.  Each knows the one above it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,20 +23,43 @@ __all__ = ["Geometry"]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+"""Axes of a cross product, written out: numpy's takes ten times as long on a few vectors."""
 
-def _convex_mesh(surface: Surface) -> tuple[FloatArray, FloatArray] | None:
-    """Corners (f, n, 3) and vector areas (f, 3) of a mesh of triangles or convex quads: nothing to cut."""
-    count, ring_sizes = surface.face_count, np.diff(surface.ring_offsets)
-    if not count or len(ring_sizes) != count or ring_sizes[0] not in (3, 4) or (ring_sizes != ring_sizes[0]).any():
-        return None
-    corners = surface.vertices[surface.ring_vertices].reshape(count, -1, 3)
-    from_first = corners[:, 1:] - corners[:, :1]
-    vectors = 0.5 * np.cross(from_first[:, :-1], from_first[:, 1:]).sum(axis=1)
-    if ring_sizes[0] == 3:
-        return corners, vectors
-    area = np.linalg.norm(vectors, axis=1)
-    convex = (area > 0) & are_convex(corners, vectors / np.where(area > 0, area, 1.0)[:, None])
-    return (corners, vectors) if convex.all() else None
+
+def _convex_meshes(surfaces: Sequence[Surface]) -> dict[int, tuple[FloatArray, FloatArray]]:
+    """Corners (f, n, 3) and vector areas (f, 3) of meshes of triangles or convex quads, by number: nothing to cut.
+
+    All surfaces at once: scenes of many small ones are common.
+    """
+    found: dict[int, tuple[FloatArray, FloatArray]] = {}
+    for many in (3, 4):
+        chosen = [
+            number
+            for number, surface in enumerate(surfaces)
+            if surface.face_count
+            and len(surface.ring_offsets) == surface.face_count + 1
+            and surface.ring_offsets[1] == many
+            and (surface.face_count == 1 or (np.diff(surface.ring_offsets) == many).all())
+        ]
+        if not chosen:
+            continue
+        rings = [surfaces[number].vertices[surfaces[number].ring_vertices].reshape(-1, many, 3) for number in chosen]
+        corners = np.concatenate(rings)
+        side = corners[:, 1:] - corners[:, :1]
+        one, two = side[:, :-1], side[:, 1:]
+        turned = one[..., _NEXT] * two[..., _LAST] - one[..., _LAST] * two[..., _NEXT]
+        vectors = 0.5 * turned.sum(axis=1)
+        good = np.ones(len(corners), dtype=bool)
+        if many == 4:
+            area = np.linalg.norm(vectors, axis=1)
+            good = (area > 0) & are_convex(corners, vectors / np.where(area > 0, area, 1.0)[:, None])
+        ends = np.cumsum([len(ring) for ring in rings])
+        for number, ring, end in zip(chosen, rings, ends.tolist(), strict=True):
+            part = slice(end - len(ring), end)
+            if good[part].all():
+                found[number] = ring, vectors[part]
+    return found
 
 
 @dataclass(frozen=True)
@@ -145,9 +169,10 @@ class Geometry:
         polygon_surface: list[IntArray] = []
         polygon_face: list[IntArray] = []
         polygons = 0
+        meshes = _convex_meshes(scene.surfaces)
         for index, surface in enumerate(scene.surfaces):
             count = surface.face_count
-            whole = _convex_mesh(surface)
+            whole = meshes.get(index)
             if whole is not None:
                 corners.append(whole[0].reshape(-1, 3))
                 sizes.append(np.full(count, whole[0].shape[1]))
