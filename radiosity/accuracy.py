@@ -26,10 +26,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radiosity.form_factors._sampling import place_on_pieces
+from radiosity.mesh_choice import Divisions, like_elements
 from radiosity.patches import PatchMesh, build_mesh
 from radiosity.sensors import Gatherer
 from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, Solution
-from radiosity.solvers.solve import begin, most_matrix_elements, require_matrix_memory, solve_by_matrix
+from radiosity.solvers.solve import (
+    MATRIX_POLYGONS,
+    begin,
+    most_matrix_elements,
+    require_matrix_memory,
+    solve_by_matrix,
+)
 from radiosity.solvers.solve import solve as solve_once
 from workbench.arrays import as_points, as_unit_vectors
 from workbench.counters import Counters
@@ -56,24 +63,29 @@ ORDER = 0.9
 """Power of the number of elements with which the meshing error falls, until it has been seen to."""
 ORDERS = (0.5, 1.5)
 """Orders that are believed when seen."""
-ROOM_ERROR = 2.0
-"""Meshing error of a room, times the number of elements to the power ``ORDER``: the first guess (Cornell box)."""
-MOST_FIRST = 700
-"""Most elements of the first mesh: what it tells is worth more than any guess."""
+ORDER_SPREAD, SEEN_SPREAD, SEEN_ELEMENTS = 0.25, 0.3, 100
+"""Standard deviation of the order from scene to scene, and of the logarithm of the ratio of two differences: larger
+where the coarser one is of fewer elements than so many."""
+ROOM_ERROR, ROOM_REFLECTANCE = 3.6, 0.55
+"""Meshing error of a room of a reflectance of 1, times the number of elements to the power ``ORDER``: the first
+guess (Cornell box); and a room's mean reflectance, where it is not known."""
+PILOT, PILOT_SHARE, MOST_FIRST = 400, 0.16, 700
+"""Where more elements are guessed to be needed, a mesh of this share of them is solved first: it costs little, and what
+it tells is worth more than any guess.  And most elements of the first mesh."""
 BUDGET_ELEMENTS = 64
 """Most elements of the first mesh where time is limited: it is solved whatever it takes."""
 SAFE = 0.9
 """Share of the asked error below which the estimate must fall: it is one itself."""
-MESHING_SHARE = 0.7
+MESHING_SHARE = 0.8
 """Share of the error that the mesh may take."""
-FACTOR_SHARE, FACTOR_ELEMENTS, MOST_FACTOR_ERROR = 0.5, 500, 0.05
+FACTOR_SHARE, FACTOR_ELEMENTS, MOST_FACTOR_ERROR = 1.0, 500, 0.05
 """Error of the rows of form factors, over the asked error, up to so many elements; and the largest."""
-LEAST_DIVIDED = 1.7
-"""Least ratio of elements to patches: with less, too little of the mesh is divided to tell what it leaves."""
-NEAR = 0.7
-"""Share of the elements asked for from which a mesh is near enough."""
+LEAST_DIVIDED = 2.5
+"""Least ratio of a mesh to its patches, see :meth:`Divisions.least`: with less, it cannot tell what it leaves."""
 LEAST_GROWTH, MOST_STUCK = 1.3, 8
 """Growth below which a mesh counts as the same, and how often the number asked for is doubled then."""
+AMPLE = 1.15
+"""Growth beyond what the estimate asks for: another mesh costs more than a larger one."""
 GROWTH = (1.6, 8.0)
 """Least and largest growth of the number of elements from mesh to mesh."""
 COST_POWER = 1.7
@@ -82,8 +94,6 @@ GATHERED = 5.0
 """Number of elements times the sum of squared form factors from a point to them: 1 in a sphere, 3 to 6 in rooms."""
 LINK_ORDER = 0.6
 """Order of hierarchical solves: links are found as well as elements are, and miss what falls slowly."""
-MATRIX_POLYGONS = 2000
-"""Scenes of at most so many polygons are solved with the full matrix."""
 LINKS_ERROR = 0.02
 """Larger scenes are solved by links, which are cheapest from so large an asked error on, and else by shooting."""
 MOST_LEVELS = 12
@@ -156,6 +166,7 @@ class _Run:
     care: float = 1.0
     at: tuple[FloatArray, FloatArray] | None = None
     scale: float = 1.0
+    guess: float = 1.0
     counters: Counters = field(default_factory=Counters)
     spent: dict[str, float] = field(default_factory=dict)
     choices: dict[str, str] = field(default_factory=dict)
@@ -233,6 +244,12 @@ def _watched(progress: Progress | None, run: _Run, message: str, stoppable: bool
     return report
 
 
+def _like(solution: Solution) -> float:
+    """How many elements alike leave as large an error as those of a solution."""
+    mesh = solution.mesh
+    return like_elements(mesh.element_area, (mesh.reflectance * solution.element_irradiance).mean(axis=1))
+
+
 def _order(levels: list[dict[str, Any]]) -> float:
     """The order at which the difference between meshes falls, as far as it can be told."""
     told = [level for level in levels if level["difference"] is not None]
@@ -240,11 +257,14 @@ def _order(levels: list[dict[str, Any]]) -> float:
         return ORDER
     before, after = told[-2:]
     # The difference of two meshes is about the error of the coarser one.
-    growth = after["coarse_elements"] / before["coarse_elements"]
+    growth = after["coarse_like"] / before["coarse_like"]
     if growth < LEAST_GROWTH:
         return ORDER
     slope = math.log(before["difference"] / after["difference"]) / math.log(growth)
-    return min(max(slope, ORDERS[0]), ORDERS[1])
+    # Of meshes that hardly differ the slope is known but roughly: what is known beforehand counts as much as it may.
+    doubt = SEEN_SPREAD * math.sqrt(1.0 + SEEN_ELEMENTS / before["coarse_like"])
+    known, seen = ORDER_SPREAD**-2, (doubt / math.log(growth)) ** -2
+    return min(max((known * ORDER + seen * slope) / (known + seen), ORDERS[0]), ORDERS[1])
 
 
 def solve(
@@ -400,15 +420,16 @@ def _method(scene: Scene, run: _Run) -> str:
     return "progressive"
 
 
-def _room_error(elements: int) -> float:
+def _room_error(elements: int, reflectance: float = ROOM_REFLECTANCE) -> float:
     """Meshing error of a room of so many elements, about."""
-    return float(ROOM_ERROR / elements**ORDER)
+    return float(ROOM_ERROR * reflectance / elements**ORDER)
 
 
-def _first_count(run: _Run) -> int:
+def _first_count(run: _Run, reflectance: float = ROOM_REFLECTANCE) -> int:
     """Number of elements of the first mesh."""
-    guess = (ROOM_ERROR / (MESHING_SHARE * _first_error(run))) ** (1.0 / ORDER)
-    return math.ceil(min(guess, BUDGET_ELEMENTS if math.isfinite(run.seconds) else MOST_FIRST))
+    guess = (_room_error(1, reflectance) / (MESHING_SHARE * _first_error(run))) ** (1.0 / ORDER)
+    run.guess = min(max(guess, 1.0), BUDGET_ELEMENTS if math.isfinite(run.seconds) else MOST_FIRST)
+    return math.ceil(run.guess * (PILOT_SHARE if guess > PILOT else 1.0))
 
 
 def _patches_as_elements(mesh: PatchMesh) -> PatchMesh:
@@ -443,19 +464,26 @@ class _Patches:
     def __init__(self, scene: Scene, run: _Run, progress: Progress | None, checkpoint: Checkpoint | None) -> None:
         self.scene, self.run, self.progress, self.checkpoint = scene, run, progress, checkpoint
         self.gatherer: Gatherer | None = None
-        self.shader: Shader | None = None
+        record = begin(scene, **run.options | {"method": "matrix", "elements": 1})  # which checks both
+        with record.stage("mesh"):
+            self.shader = Shader(Geometry.from_scene(scene), record.settings["workers"])
+            self.divisions = Divisions(scene, self.shader.geometry)
+        run.spent |= record.seconds
+
+    def first(self) -> int:
+        """Number of elements of the first mesh."""
+        return _first_count(self.run, self.divisions.reflectance)
 
     def solve(self, count: int, stoppable: bool) -> Solution:
         """Solve a mesh of about so many elements, and its patches."""
         run = self.run
         # The errors of more and smaller form factors cancel better; and no finer than this mesh can be right.
-        needed = max(run.target * math.sqrt(max(count / FACTOR_ELEMENTS, 1.0)), 0.5 * _room_error(count))
+        expected = _room_error(count, self.divisions.reflectance)
+        needed = max(run.target * math.sqrt(max(count / FACTOR_ELEMENTS, 1.0)), 0.5 * expected)
         factor_error = min(run.care * FACTOR_SHARE * needed, MOST_FACTOR_ERROR)
         asked = run.options | {"method": "matrix", "elements": count, "form_factor_error": factor_error}
         record = begin(self.scene, **asked)
         with record.stage("mesh"):
-            if self.shader is None:
-                self.shader = Shader(Geometry.from_scene(self.scene), record.settings["workers"])
             mesh = self._divided(count)
             patches = _patches_as_elements(mesh)
         require_matrix_memory(mesh.element_count)
@@ -466,29 +494,15 @@ class _Patches:
         return solution
 
     def _divided(self, count: int) -> PatchMesh:
-        """A mesh that is finer than its patches where it matters."""
-        assert self.shader is not None
-        geometry = self.shader.geometry
+        """A mesh of about so many elements, or of more, so that it is finer than its patches where it matters."""
+        elements = self.divisions.least(count, LEAST_DIVIDED)
+        return build_mesh(self.scene, self.shader.geometry, elements=elements, split=2, cluster=False)
 
-        def made(elements: int) -> PatchMesh:
-            return build_mesh(self.scene, geometry, elements=elements, split=2, cluster=False)
-
-        mesh = made(count)
-        if mesh.element_count < NEAR * count:
-            # Of polygons alike in size the number jumps, and no more are made than asked for.
-            larger = made(2 * count)
-            mesh = larger if larger.element_count * mesh.element_count < count**2 else mesh
-        while True:
-            if not mesh.reflectance.any() or mesh.element_count >= LEAST_DIVIDED * mesh.patch_count:
-                return mesh
-            count *= 2
-            mesh = made(count)
-
-    def compare(self, solution: Solution) -> tuple[float | None, int]:
-        """What the mesh and its patches differ by, and the number of these."""
+    def compare(self, solution: Solution) -> tuple[float | None, float]:
+        """What the mesh and its patches differ by, and how many elements alike these are as good as."""
         mesh, coarse = solution.mesh, self.coarse
         if not mesh.reflectance.any():
-            return 0.0, coarse.mesh.element_count
+            return 0.0, 0.0
         if self.gatherer is None:
             self.gatherer = Gatherer(solution, shader=self.shader)
         else:
@@ -504,7 +518,13 @@ class _Patches:
                 break
         if self.run.at is None:
             difference = max(difference, _surface_difference(solution, coarse, mean))
-        return difference, coarse.mesh.element_count
+        return difference, _like(coarse)
+
+    def finer(self, solution: Solution, times: float) -> int:
+        """Elements of a mesh with so many times more where it is divided: the rest is small."""
+        members = np.diff(solution.mesh.patch_start)
+        whole = int((members == 1).sum())
+        return whole + math.ceil((solution.mesh.element_count - whole) * times)
 
     def keep(self, solution: Solution, count: int) -> None:
         """Let the caller save a whole mesh, from which a mesh of ``count`` elements follows."""
@@ -549,6 +569,10 @@ class _Meshes:
         if stored is not None:
             self.seen = np.asarray(stored)
 
+    def first(self) -> int:
+        """Number of elements of the first mesh."""
+        return _first_count(self.run)
+
     def solve(self, count: int, stoppable: bool) -> Solution:
         """Solve a mesh of about so many elements."""
         run = self.run
@@ -580,8 +604,8 @@ class _Meshes:
             **asked,
         )
 
-    def compare(self, solution: Solution) -> tuple[float | None, int]:
-        """What the mesh and the one before differ by, and the number of elements of that."""
+    def compare(self, solution: Solution) -> tuple[float | None, float]:
+        """What the mesh and the one before differ by, and how many elements alike that is as good as."""
         if self.gatherer is None:
             self.gatherer = Gatherer(solution, workers=self.run.options.get("workers"))
             # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
@@ -592,12 +616,16 @@ class _Meshes:
         seen = _look(reading, self.points, self._row(), self.run)
         before, self.seen = self.seen, seen
         if before is None:
-            return None, 0
-        return _difference(seen, before, mean)[0], self.run.levels[-1]["elements"]
+            return None, 0.0
+        return _difference(seen, before, mean)[0], self.run.levels[-1]["like"]
 
     def _row(self) -> int:
         """Row of :data:`LOOKS`, one for all meshes: they are compared at the same points."""
         return _effort(self.run, BUDGET_ELEMENTS)
+
+    def finer(self, solution: Solution, times: float) -> int:
+        """Elements of a mesh with so many times more."""
+        return math.ceil(solution.mesh.element_count * times)
 
     def keep(self, solution: Solution, count: int) -> None:
         """These methods save themselves within each mesh."""
@@ -609,16 +637,16 @@ def _refine(
     """Solve finer and finer meshes until the estimate is below the target."""
     best: Solution | None = None
     estimate = ErrorEstimate(math.inf, 0.0, 0.0, 0.0)
-    count = _first_count(run)
-    if resume is not None:
-        run.levels = list(resume.record.results.get("levels", []))
-        count = int(resume.record.settings.get("elements") or count)
     method = _method(scene, run)
     levels: _Patches | _Meshes
     if method == "matrix":
         levels = _Patches(scene, run, progress, checkpoint)
     else:
         levels = _Meshes(scene, run, method, progress, checkpoint, resume)
+    count = levels.first()
+    if resume is not None:
+        run.levels = list(resume.record.results.get("levels", []))
+        count = int(resume.record.settings.get("elements") or count)
     stuck = 0
     while True:
         try:
@@ -646,13 +674,14 @@ def _refine(
         start = time.perf_counter()
         difference, coarse = levels.compare(solution)
         best, stuck = solution, 0
-        run.levels.append({"elements": n, "coarse_elements": coarse, "difference": difference})
+        like = _like(solution)
+        run.levels.append({"elements": n, "like": like, "coarse_like": coarse, "difference": difference})
         order = _order(run.levels)
         if method == "hierarchical":
             order = min(order, LINK_ORDER)
         meshing = math.inf
         if difference is not None:
-            meshing = difference / ((n / coarse) ** order - 1.0) if difference > 0 else 0.0
+            meshing = difference / ((like / coarse) ** order - 1.0) if difference > 0 else 0.0
         estimate = _parts(solution, meshing, run.scale)
         now = time.perf_counter()
         run.spent["error estimate"] = run.spent.get("error estimate", 0.0) + now - start
@@ -663,7 +692,7 @@ def _refine(
             return _finish(run, solution, estimate, f"{MOST_LEVELS} meshes did not reach the target")
         want = 3.0 if not math.isfinite(meshing) else GROWTH[1]
         if run.target > 0 and math.isfinite(meshing):
-            want = (meshing / (MESHING_SHARE * run.target)) ** (1.0 / order) * 1.1
+            want = (meshing / (MESHING_SHARE * run.target)) ** (1.0 / order) * AMPLE
             if estimate.form_factors > 0.3 * run.target:
                 run.care *= max(0.2 * run.target / estimate.form_factors, 0.1)
         want = min(max(want, GROWTH[0]), GROWTH[1])
@@ -671,7 +700,10 @@ def _refine(
         fits = (max(run.left, 0.0) / max(took, 1e-3)) ** (1.0 / COST_POWER)
         if fits < GROWTH[0]:
             return _finish(run, solution, estimate, "another mesh would not fit into the time")
-        count = math.ceil(n * min(want, max(fits, GROWTH[0])))
+        count = levels.finer(solution, min(want, max(fits, GROWTH[0])))
+        if len(run.levels) == 1 and count < run.guess <= fits * n:
+            # One small mesh tells but roughly: the first guess counts as much.
+            count = math.ceil(math.sqrt(count * run.guess))
         if method == "matrix" and count > most_matrix_elements():
             count = most_matrix_elements()
             if count < GROWTH[0] * n:

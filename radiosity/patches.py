@@ -34,7 +34,7 @@ LEAST_TOUCHING = 0.2
 COARSE_CLUSTERS = 12
 """Least number of cubes over a tessellated surface, however coarse the mesh."""
 
-__all__ = ["PatchMesh", "build_mesh", "forecast_elements"]
+__all__ = ["Extents", "PatchMesh", "build_mesh", "edge_scales", "forecast_elements"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -302,7 +302,7 @@ def _mesh_polygon(rings: list[FloatArray], pieces: list[FloatArray], edge: float
 
 
 @dataclass(frozen=True)
-class _Extents:
+class Extents:
     """What decides into how many elements the polygons of a surface fall.
 
     Quads and other polygons fall into ``share`` of the cells of a grid over ``along`` x ``across``; of triangles,
@@ -314,7 +314,7 @@ class _Extents:
     share: FloatArray
 
     @classmethod
-    def of_surface(cls, surface: Surface) -> _Extents:
+    def of_surface(cls, surface: Surface) -> Extents:
         """Measure every polygon once."""
         sizes = np.diff(surface.ring_offsets)
         if len(sizes) == surface.face_count and (sizes == sizes[0]).all() and sizes[0] in (3, 4):
@@ -346,7 +346,7 @@ class _Extents:
         return np.maximum(1, np.ceil(self.share * along * across)).astype(np.int64)
 
 
-def _edge_scales(geometry: Geometry) -> FloatArray:
+def edge_scales(geometry: Geometry) -> FloatArray:
     """How much longer (q,) the elements' edges are on a polygon that is far larger than all smaller ones together.
 
     A yard of a thousand times the area of the house on it would else get all elements, and the house none.
@@ -366,7 +366,7 @@ def forecast_elements(
     scene: Scene,
     edge: float,
     split: int = 2,
-    extents: list[_Extents] | None = None,
+    extents: list[Extents] | None = None,
     scales: FloatArray | None = None,
 ) -> int:
     """About how many elements :func:`build_mesh` makes for a largest edge, without making them.
@@ -380,7 +380,7 @@ def forecast_elements(
             continue
         edges = edge if scales is None else edge * scales[first : first + surface.face_count]
         first += surface.face_count
-        n = (extents[number] if extents is not None else _Extents.of_surface(surface)).counts(edges, split)
+        n = (extents[number] if extents is not None else Extents.of_surface(surface)).counts(edges, split)
         small = small_facets(surface, edge) if (np.diff(surface.ring_offsets) == 3).all() else ()
         if len(small):
             n[small] = 0
@@ -399,7 +399,7 @@ def forecast_elements(
 
 def _edge_for(scene: Scene, geometry: Geometry, elements: int, split: int, scales: FloatArray) -> float:
     """Largest edge that gives about the asked number of elements, by bisection."""
-    extents = [_Extents.of_surface(surface) for surface in scene.surfaces]
+    extents = [Extents.of_surface(surface) for surface in scene.surfaces]
     high = 2.0 * geometry.size
     if forecast_elements(scene, high, split, extents, scales) >= elements:
         return math.inf
@@ -488,7 +488,7 @@ def build_mesh(
     if max_edge is not None:
         edge = max_edge
     elif elements is not None:
-        scales = _edge_scales(geometry)
+        scales = edge_scales(geometry)
         edge = _edge_for(scene, geometry, elements, split, scales)
     # One element a polygon is asked for as such; elements of a mesh end where something stands on them.
     contacts = contact_lines(geometry, NEAR * edge, LEAST_TOUCHING * edge) if math.isfinite(edge) else {}

@@ -179,7 +179,10 @@ def contour_integral_in(p, np_, q, nq, tolerance, stack):
                         rx, ry, rz = gx - xs[m] * fx - mx, gy - xs[m] * fy - my, gz - xs[m] * fz - mz
                         # |m + r|^2 - |m|^2 without forming the large squares first.
                         excess = rx * (rx + 2.0 * mx) + ry * (ry + 2.0 * my) + rz * (rz + 2.0 * mz)
-                        row += ws[m] * math.log1p(excess / square0)
+                        if excess > -0.5 * square0:
+                            row += ws[m] * math.log1p(excess / square0)
+                        else:  # edges far shorter than the way between the centroids, left by clipping in a corner
+                            row += ws[m] * math.log(((rx + mx) ** 2 + (ry + my) ** 2 + (rz + mz) ** 2) / square0)
                     value += ws[k] * row
                 total += 0.5 * dot * value
                 rounding += _FAR_ROUNDING * abs(0.5 * dot * value)

@@ -28,7 +28,9 @@ IntArray = NDArray[np.int64]
 POINTS = 4
 """Points an element at which lights without surface and the sky are evaluated."""
 FEW_ELEMENTS, MORE_POINTS = 256, 16
-"""Points an element for the sky in meshes of few elements, which are large."""
+"""Points an element for the sky in meshes of few elements, which are large, where these points differ:"""
+UNEVEN = 0.2
+"""Deviation of the light at the points of an element from which there are more, over the wanted error."""
 
 # Generalised golden ratio in two dimensions.
 _G2 = 1.3247179572447460
@@ -80,9 +82,8 @@ def points_of_elements(mesh: PatchMesh, chosen: IntArray, count: int, seed: int)
     return points.reshape(-1, 3)
 
 
-def _points(mesh: PatchMesh, first: int, last: int, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    points = points_of_elements(mesh, np.arange(first, last), count, seed)
-    return points, np.repeat(mesh.element_normal[first:last], count, axis=0)
+def _points(mesh: PatchMesh, chosen: IntArray, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    return points_of_elements(mesh, chosen, count, seed), np.repeat(mesh.element_normal[chosen], count, axis=0)
 
 
 def _from_light(
@@ -132,7 +133,7 @@ def _light_means(
     Points at random places of their strata see how much of the light is hidden; what is not hidden
     is smooth and integrated by Gauss's rule, on elements that are parallelograms.
     """
-    points, normals = _points(mesh, first, last, POINTS, seed)
+    points, normals = _points(mesh, np.arange(first, last), POINTS, seed)
     smooth, fits = np.zeros_like(points), np.zeros(last - first, dtype=np.bool_)
     _smooth_points(mesh.corners, mesh.piece_start, mesh.element_piece, first, last, smooth, fits)
     total = np.zeros(last - first)
@@ -146,16 +147,21 @@ def _light_means(
 
 
 def _from_sky(
-    mesh: PatchMesh, first: int, last: int, count: int, rays: int, seed: int, sky: SkyLight, shader: Shader
+    mesh: PatchMesh, chosen: IntArray, count: int, rays: int, seed: int, sky: SkyLight, shader: Shader
 ) -> FloatArray:
-    """Mean irradiance (elements, bands) of elements from the sky: exact at ``count`` points, or by rays."""
-    points, normals = _points(mesh, first, last, count, seed)
-    own = np.repeat(mesh.element_polygon[first:last], count)
-    shares = sky.shares(shader, points, normals, own_polygon=own, error=1e-3)
-    crowded = np.flatnonzero(np.isnan(shares[:, 0]))
-    if len(crowded):
-        shares[crowded] = _sky_by_rays(points[crowded], normals[crowded], rays, [seed, first], sky, shader)
-    return sky.irradiance(shares.reshape(-1, count, 2).mean(axis=1))
+    """Irradiance (k, count, bands) from the sky at points of the chosen elements: exact, or by rays."""
+    out = np.empty((len(chosen), count, mesh.bands))
+    step = max(1, BLOCK_RAYS // (4 * count))
+    for first in range(0, len(chosen), step):
+        block = chosen[first : first + step]
+        points, normals = _points(mesh, block, count, seed)
+        own = np.repeat(mesh.element_polygon[block], count)
+        shares = sky.shares(shader, points, normals, own_polygon=own, error=1e-3)
+        crowded = np.flatnonzero(np.isnan(shares[:, 0]))
+        if len(crowded):
+            shares[crowded] = _sky_by_rays(points[crowded], normals[crowded], rays, [seed, int(block[0])], sky, shader)
+        out[first : first + step] = sky.irradiance(shares).reshape(-1, count, mesh.bands)
+    return out
 
 
 def cosine_directions(normals: FloatArray, count: int, seed: list[int]) -> FloatArray:
@@ -194,6 +200,7 @@ def incident_irradiance(
     mesh: PatchMesh,
     tracer: EmbreeAccelerator,
     *,
+    error: float = 0.0,
     sky_rays: int = 128,
     seed: int = 0,
     shader: Shader | None = None,
@@ -205,6 +212,9 @@ def incident_irradiance(
     scene, mesh : Scene, PatchMesh
     tracer : EmbreeAccelerator
         Over the scene's geometry.
+    error : float
+        Wanted error of the sky's light, relative to the mean of all that arrives: where the light at a few points of
+        an element differs by little of it, these are enough.
     sky_rays : int
         Cosine-distributed rays a point of an element toward the sky, where its occluders are too many
         to be cut.
@@ -228,11 +238,14 @@ def incident_irradiance(
             out[first:last] += _light_means(light, mesh, first, last, seed, tracer)[:, None] * light.power
     if sky is not None:
         shader = shader if shader is not None else Shader(Geometry.from_scene(scene))
-        count = POINTS if mesh.element_count > FEW_ELEMENTS else MORE_POINTS
-        step = max(1, BLOCK_RAYS // (4 * count))
-        for first in range(0, mesh.element_count, step):
-            last = min(first + step, mesh.element_count)
-            out[first:last] += _from_sky(mesh, first, last, count, sky_rays, seed, sky, shader)
+        everything = np.arange(mesh.element_count)
+        found = _from_sky(mesh, everything, POINTS, sky_rays, seed, sky, shader)
+        mean = found.mean(axis=1)
+        if mesh.element_count <= FEW_ELEMENTS:
+            level = mesh.element_area @ (out + mean) / mesh.element_area.sum()
+            uneven = np.flatnonzero((found.std(axis=1) > UNEVEN * error * level).any(axis=1))
+            mean[uneven] = _from_sky(mesh, uneven, MORE_POINTS, sky_rays, seed, sky, shader).mean(axis=1)
+        out += mean
     return out
 
 
@@ -261,7 +274,7 @@ def incident_spread(
     step = max(1, BLOCK_RAYS // MORE_POINTS)
     for first in range(0, mesh.element_count, step):
         last = min(first + step, mesh.element_count)
-        points, normals = _points(mesh, first, last, MORE_POINTS, seed)
+        points, normals = _points(mesh, np.arange(first, last), MORE_POINTS, seed)
         total = np.zeros((last - first, MORE_POINTS, mesh.bands))
         for light in scene.lights:
             samples = POINTS if light.kind == "linear" else 1
@@ -271,14 +284,6 @@ def incident_spread(
     sky = SkyLight.of_scene(scene)
     if sky is not None:
         shader = shader if shader is not None else Shader(Geometry.from_scene(scene))
-        for first in range(0, mesh.element_count, step):
-            last = min(first + step, mesh.element_count)
-            points, normals = _points(mesh, first, last, POINTS, seed)
-            own = np.repeat(mesh.element_polygon[first:last], POINTS)
-            shares = sky.shares(shader, points, normals, own_polygon=own, error=1e-3)
-            crowded = np.flatnonzero(np.isnan(shares[:, 0]))
-            if len(crowded):
-                shares[crowded] = _sky_by_rays(points[crowded], normals[crowded], sky_rays, [seed, first], sky, shader)
-            spread = sky.irradiance(shares).reshape(-1, POINTS, mesh.bands).std(axis=1)
-            out[first:last] = np.hypot(out[first:last], spread)
+        found = _from_sky(mesh, np.arange(mesh.element_count), POINTS, sky_rays, seed, sky, shader)
+        out = np.hypot(out, found.std(axis=1))
     return out

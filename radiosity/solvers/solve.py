@@ -6,7 +6,7 @@ import copy
 import math
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -35,13 +35,46 @@ FULL = ("direct", "matrix")
 
 DEFAULT_ELEMENTS = 2000
 DEFAULT_LINK_ERROR = 1e-3
-DIRECT_ELEMENTS = 64
-"""Scenes of at most this many elements are solved directly."""
+MATRIX_POLYGONS, MATRIX_ELEMENTS = 2000, 4000
+"""Scenes of at most so many polygons are solved with the full matrix, up to so many elements if no error is asked."""
+DIRECT_ELEMENTS, LEAST_MATRIX_ERROR = 64, 1e-4
+"""Up to so many elements form factors are found column by column where they are asked to a smaller error."""
 EXACT_ELEMENTS = 12
 """Up to this many elements form factors are found to 1e-8: a second at most."""
 
 ONE_LEVEL_ELEMENTS = 1600
 """Up to this many elements, each shoots for itself; above, patches of 2 x 2 elements shoot."""
+
+
+class SolveOptions(TypedDict, total=False):
+    """The options of :func:`solve`, explained there."""
+
+    method: str
+    elements: int | None
+    max_edge: float | None
+    rays: int
+    tolerance: float
+    form_factor_error: float | None
+    link_error: float | None
+    direct_in_mesh: bool
+    bundles: str
+    workers: int | None
+    seed: int
+
+
+DEFAULTS: SolveOptions = {
+    "method": "auto",
+    "elements": None,
+    "max_edge": None,
+    "rays": 16,
+    "tolerance": 0.01,
+    "form_factor_error": None,
+    "link_error": None,
+    "direct_in_mesh": True,
+    "bundles": "receiver",
+    "workers": None,
+    "seed": 0,
+}
 
 # Bytes an element costs while a mesh is made and solved, beside its bands.
 _ELEMENT_BYTES = 3000
@@ -72,9 +105,8 @@ def _settings(error: float, rays: int, seed: int, patches: int) -> LinkSettings:
     )
 
 
-def _check(
-    scene: Scene, method: str, elements: int | None, max_edge: float | None, rays: int, tolerance: float, workers: int
-) -> None:
+def _check(scene: Scene, settings: dict[str, Any]) -> None:
+    method, elements, max_edge = settings["method"], settings["elements"], settings["max_edge"]
     if method not in METHODS:
         raise OptionError(f"method: found {method!r}, expected one of {', '.join(METHODS)}")
     if elements is not None and max_edge is not None:
@@ -83,12 +115,11 @@ def _check(
         raise OptionError(f"elements: found {elements}, expected 1 or more")
     if max_edge is not None and not (math.isfinite(max_edge) and max_edge > 0):
         raise OptionError(f"max_edge: found {max_edge}, expected a positive length")
-    if rays < 1:
-        raise OptionError(f"rays: found {rays}, expected 1 or more")
-    if not 0 < tolerance < 1:
-        raise OptionError(f"tolerance: found {tolerance}, expected a number between 0 and 1")
-    if workers < 1:
-        raise OptionError(f"workers: found {workers}, expected 1 or more")
+    for name in ("rays", "workers"):
+        if settings[name] < 1:
+            raise OptionError(f"{name}: found {settings[name]}, expected 1 or more")
+    if not 0 < settings["tolerance"] < 1:
+        raise OptionError(f"tolerance: found {settings['tolerance']}, expected a number between 0 and 1")
     where = str(scene.path) if scene.path is not None else scene.name
     if not any(surface.face_count for surface in scene.surfaces):
         raise InputError(f"{where}: found no surface; add a [[surface]] to the scene")
@@ -183,20 +214,10 @@ def _resumed(scene: Scene, mesh: PatchMesh, previous: Solution, record: RunRecor
 def solve(
     scene: Scene,
     *,
-    method: str = "auto",
-    elements: int | None = None,
-    max_edge: float | None = None,
-    rays: int = 16,
-    tolerance: float = 0.01,
-    form_factor_error: float | None = None,
-    link_error: float | None = None,
-    direct_in_mesh: bool = True,
-    bundles: str = "receiver",
-    workers: int | None = None,
-    seed: int = 0,
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
     resume: Solution | None = None,
+    **options: Unpack[SolveOptions],
 ) -> Solution:
     """Solve a scene for radiosity.
 
@@ -207,7 +228,8 @@ def solve(
     method : str
         ``progressive`` (shooting), ``hierarchical`` (links at the coarsest level that will do, elements
         where the light changes), ``direct`` (full matrix, by columns; small scenes), ``matrix`` (full
-        matrix, reciprocal by construction, pairs settled in groups; up to some thousand elements), or ``auto``.
+        matrix, reciprocal by construction, pairs settled in groups; up to some thousand elements), or ``auto``: full
+        where it fits, since nothing is left unshot then, else ``progressive``.
     elements : int, optional
         About how many elements; 1 gives one a polygon.  Default 2,000 (or one a polygon, if there
         are more polygons).
@@ -256,12 +278,9 @@ def solve(
     Specular reflection and refraction are left to the picture: their share is absorbed here.  Panes
     (transmittance above 0) dim what is cut exactly and block rays; ``record.choices`` says so.
     """
-    record = begin(
-        scene, method=method, elements=elements, max_edge=max_edge, rays=rays, tolerance=tolerance,
-        form_factor_error=form_factor_error, link_error=link_error, direct_in_mesh=direct_in_mesh, bundles=bundles,
-        workers=workers, seed=seed,
-    )  # fmt: skip
-    elements, link_error, count = (record.settings[name] for name in ("elements", "link_error", "workers"))
+    record = begin(scene, **options)
+    settings = record.settings
+    method, elements, max_edge = settings["method"], settings["elements"], settings["max_edge"]
     with record.stage("mesh"):
         geometry = Geometry.from_scene(scene)
     if method == "hierarchical":
@@ -272,72 +291,91 @@ def solve(
             scene,
             geometry,
             record,
-            link_error=link_error,
+            link_error=settings["link_error"],
             max_elements=elements,
             max_edge=max_edge,
-            direct_in_mesh=direct_in_mesh,
-            form_factor_error=form_factor_error,
-            tolerance=min(tolerance, 1e-4),
-            workers=count,
-            seed=seed,
+            direct_in_mesh=settings["direct_in_mesh"],
+            form_factor_error=settings["form_factor_error"],
+            tolerance=min(settings["tolerance"], 1e-4),
+            workers=settings["workers"],
+            seed=settings["seed"],
             progress=progress,
             checkpoint=checkpoint,
             resume=resume,
         )
+    if method == "auto":
+        method = _chosen(scene, geometry, record, resume)
+    whole = method in FULL
     with record.stage("mesh"):
-        whole = method in FULL
         mesh = build_mesh(
             scene, geometry, elements=elements, max_edge=max_edge, split=1 if whole else 2, cluster=not whole
         )
-    n = mesh.element_count
-    if method == "auto":
-        method = "direct" if n <= DIRECT_ELEMENTS else "progressive"
-        record.choices["method"] = f"{method}: {n} elements, direct up to {DIRECT_ELEMENTS}"
-    if mesh.patch_count < n and (method in FULL or n <= ONE_LEVEL_ELEMENTS):
-        with record.stage("mesh"):
-            cluster = method not in FULL
-            mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1, cluster=cluster)
+        if not whole and mesh.patch_count < mesh.element_count <= ONE_LEVEL_ELEMENTS:
+            mesh = build_mesh(scene, geometry, elements=elements, max_edge=max_edge, split=1)
     _forecast(scene, mesh.element_count, None, method)
     if method == "matrix":
         with record.stage("prepare"):
-            shader = Shader(geometry, count)
+            shader = Shader(geometry, settings["workers"])
         return solve_by_matrix(scene, shader, mesh, record, progress=progress)[0]
     return solve_by_patches(
         scene, geometry, mesh, record, method=method, progress=progress, checkpoint=checkpoint, resume=resume
     )
 
 
-def begin(
-    scene: Scene,
-    *,
-    method: str = "auto",
-    elements: int | None = None,
-    max_edge: float | None = None,
-    rays: int = 16,
-    tolerance: float = 0.01,
-    form_factor_error: float | None = None,
-    link_error: float | None = None,
-    direct_in_mesh: bool = True,
-    bundles: str = "receiver",
-    workers: int | None = None,
-    seed: int = 0,
-) -> RunRecord:
+def _chosen(scene: Scene, geometry: Geometry, record: RunRecord, resume: Solution | None) -> str:
+    """The method of ``auto``."""
+    settings, polygons = record.settings, geometry.polygon_count
+    elements = settings["elements"] or forecast_elements(scene, settings["max_edge"])
+    error = settings["form_factor_error"]
+    if resume is not None and resume.shooting is not None:
+        method, reason = "progressive", "what is resumed was"
+    elif settings["bundles"] != "receiver":
+        method, reason = "progressive", f"bundles are {settings['bundles']}"
+    elif polygons > MATRIX_POLYGONS:
+        method, reason = "progressive", f"{polygons} polygons, all form factors at once up to {MATRIX_POLYGONS}"
+    elif max(elements, polygons) > min(MATRIX_ELEMENTS, most_matrix_elements()):
+        method, reason = "progressive", f"about {elements} elements, all form factors at once up to {MATRIX_ELEMENTS}"
+    else:
+        # Nothing is left unshot then: a dim room beside a bright yard is right, too.
+        few = forecast_elements(scene, math.inf, 1) <= EXACT_ELEMENTS and elements <= EXACT_ELEMENTS
+        exact = few or (error is not None and error < LEAST_MATRIX_ERROR and elements <= DIRECT_ELEMENTS)
+        method = "direct" if exact else "matrix"
+        reason = f"{polygons} polygons and about {max(elements, polygons)} elements, all form factors at once"
+    record.choices["method"] = f"{method}: {reason}"
+    return method
+
+
+def begin(scene: Scene, **options: Unpack[SolveOptions]) -> RunRecord:
     """Check the scene and the options of a solve, see :func:`solve`, and forecast its memory.
 
     Returns
     -------
     RunRecord
         With the settings, defaults filled in.
+
+    Raises
+    ------
+    TypeError
+        If there is no such option.
+    InputError, OptionError, MemoryForecastError
+        As :func:`solve`.
     """
-    count = workers if workers is not None else len(os.sched_getaffinity(0))
-    _check(scene, method, elements, max_edge, rays, tolerance, count)
+    unknown = sorted(set(options) - set(DEFAULTS))
+    if unknown:
+        raise TypeError(f"solve() got an unexpected keyword argument {unknown[0]!r}")
+    settings: dict[str, Any] = {"scene": scene.name, **DEFAULTS, **options}
+    if settings["workers"] is None:
+        settings["workers"] = len(os.sched_getaffinity(0))
+    _check(scene, settings)
+    method, elements, max_edge = settings["method"], settings["elements"], settings["max_edge"]
+    bundles, form_factor_error = settings["bundles"], settings["form_factor_error"]
     if method != "hierarchical":
-        if link_error is not None or not direct_in_mesh:
+        if settings["link_error"] is not None or not settings["direct_in_mesh"]:
             raise OptionError(f"link_error and direct_in_mesh: found with method {method!r}, expected 'hierarchical'")
         if elements is None and max_edge is None:
-            elements = DEFAULT_ELEMENTS
-    elif link_error is None and elements is None:
-        link_error = DEFAULT_LINK_ERROR
+            settings["elements"] = elements = DEFAULT_ELEMENTS
+    elif settings["link_error"] is None and elements is None:
+        settings["link_error"] = DEFAULT_LINK_ERROR
     if bundles not in BUNDLES:
         raise OptionError(f"bundles: found {bundles!r}, expected one of {', '.join(BUNDLES)}")
     if method == "hierarchical" and bundles != "receiver":
@@ -348,20 +386,6 @@ def begin(
     if form_factor_error is not None and not 0 < form_factor_error < 1:
         raise OptionError(f"form_factor_error: found {form_factor_error}, expected a number between 0 and 1")
     _forecast(scene, elements, max_edge, method)
-    settings: dict[str, Any] = {
-        "scene": scene.name,
-        "method": method,
-        "elements": elements,
-        "max_edge": max_edge,
-        "rays": rays,
-        "tolerance": tolerance,
-        "form_factor_error": form_factor_error,
-        "link_error": link_error,
-        "direct_in_mesh": direct_in_mesh,
-        "bundles": bundles,
-        "workers": count,
-        "seed": seed,
-    }
     return RunRecord(command="solve", settings=settings)
 
 
@@ -420,7 +444,7 @@ def solve_by_matrix(
     error = _accuracy(record, mesh.element_count, "matrix")
     tracer = EmbreeAccelerator(shader.geometry)
     with record.stage("incident light"):
-        incident = incident_irradiance(scene, mesh, tracer, seed=settings["seed"], shader=shader)
+        incident = incident_irradiance(scene, mesh, tracer, error=error, seed=settings["seed"], shader=shader)
     record.counters.merge(tracer.counters)
     solution = _start(scene, mesh, incident, record)
     coarse = None
@@ -465,7 +489,7 @@ def solve_by_patches(
         if resume is None or method == "direct":
             # A full solve has no half-way state to go on from.
             with record.stage("incident light"):
-                incident = incident_irradiance(scene, mesh, finder.accelerator, seed=settings["seed"])
+                incident = incident_irradiance(scene, mesh, finder.accelerator, error=error, seed=settings["seed"])
             solution = _start(scene, mesh, incident, record)
             record.counters.merge(finder.accelerator.counters)
         else:

@@ -49,7 +49,7 @@ def test_parts_add_up_and_levels_tell_the_story():
     parts = ("meshing", "form_factors", "visibility", "convergence")
     assert estimate["total"] == pytest.approx(sum(estimate[name] for name in parts), rel=1e-12)
     levels = record.results["levels"]
-    assert len(levels) > 1 and all(level["coarse_elements"] < level["elements"] for level in levels)
+    assert len(levels) > 1 and all(level["coarse_like"] < level["like"] for level in levels)
     assert [level["elements"] for level in levels] == sorted({level["elements"] for level in levels})
     assert levels[-1]["total"] == estimate["total"] <= 0.0005
     assert record.settings["error"] == 0.0005 and "below the target" in record.choices["stop"]
@@ -178,6 +178,11 @@ def test_the_error_can_be_asked_for_where_it_matters():
     solution = radiosity.solve(scene, error=0.02, at=(points, normals))
     found = solution.irradiance(points, normals, error=0.005).irradiance
     assert np.abs(found / 2e-3 - 1).max() < 0.02
+    # Without an error nothing is left unshot, wherever it would go.
+    plain = radiosity.solve(scene, elements=400)
+    dim = plain.mesh.element_surface == 0
+    assert np.abs(plain.element_irradiance[dim] / 2e-3 - 1).max() < 0.02
+    assert plain.record.choices["method"].startswith("matrix")
     assert "given points" in solution.record.errors["definition"]
     with pytest.raises(InputError, match="as many of both"):
         radiosity.solve(scene, error=0.02, at=(points, normals[:1]))

@@ -13,6 +13,7 @@ from instrument_scenes import rectangle
 from radiosity_scenes import each_truth, polygon_scene, truth
 
 import radiosity
+from radiosity.form_factors._contour import contour_integral
 from radiosity.form_factors.analytic import crossed_strings, polygon_to_polygon
 from workbench.accel.brute import BruteForce
 from workbench.errors import InputError
@@ -258,3 +259,16 @@ def test_scale_and_place_change_nothing(scale, shift):
     moved = [polygon @ turn.T * scale + shift for polygon in (LOWER, UPPER, occluder)]
     found = radiosity.form_factor(moved[0], moved[1], [moved[2]], error=1e-6)
     assert abs(found - plain) <= found.error <= 1e-6
+
+
+def test_edges_that_clipping_leaves_in_a_common_corner_add_nothing():
+    """A ceiling's triangle and a wall's that touch in one corner, each cut there by the other's plane.
+
+    Slivers of 1e-10 are far from each other for their length and near for the pair: their distance is lost in the
+    pair's.  Moved apart by 1e-7 the same two exchange the same.
+    """
+    ceiling = np.array([[0.53, 0.0, 2.65], [0.53 + 7.5e-11, 0.0, 2.65], [0.53, -2.0, 2.65], [-0.32, -2.0, 2.65]])
+    wall = np.array([[0.53 + 8e-10, 0.0, 2.65], [0.0, 0.0, 0.0], [0.53 + 1e-9, 0.0, -0.35], [0.53 + 1e-9, 0.0, 2.65]])
+    found, rounding = contour_integral(ceiling, 4, wall, 4, 1e-9)
+    apart, _ = contour_integral(ceiling + [0, 0, 1e-7], 4, wall, 4, 1e-9)
+    assert found == pytest.approx(apart, rel=1e-5) and 0.0 < found < 0.03 and rounding < 1e-12
