@@ -14,12 +14,11 @@ import numpy as np
 from numba import njit
 
 from radiosity.form_factors._contour import contour_integral_in
-from radiosity.form_factors._links import _cell_points
 from radiosity.form_factors._pairs import _PLAIN, CLEARS, HIDES, _axis_verdict, _heights, crossings, seen_share, verdict
 from radiosity.form_factors.analytic import _clip_pair
 from workbench.culling.tally import CLOSED, COMPLEX, DARK, SHAFT_CULL, SHAFT_TEST
 from workbench.geometry.lambert import lambert_piece
-from workbench.geometry.planes import clip_by_plane
+from workbench.geometry.planes import clip_by_plane, newell_normal
 
 ROWS = 128
 """Most cells that wait to be halved."""
@@ -30,11 +29,8 @@ SHORT = 48
 
 CLOSE = 1.0
 """Height over the other end, in radii of a cell, below which the closed form of the cell is worth its time."""
-NARROW = 1.0
-"""Width of a shadow, in radii of a cell, below which the cell's points may miss it."""
-
-UNSEEN = 0.1
-"""Share of a cell's open exchange that its points may miss where they see nothing, and nothing proves it dark."""
+UNSEEN = 0.03
+"""Share of a cell's open exchange that the points of its rule may miss where what is seen changes its form."""
 
 PARTS = 64
 """Most parts into which an end is cut beforehand, along what touches it."""
@@ -44,7 +40,26 @@ TOUCHING = 0.02
 THIN, MOST_LAYERS = 0.3, 10
 """Distance of the ends, in extents of one, below which a penumbra is a thin layer; most cuts on either side of it."""
 
-UNKNOWN, ROUGH, EXACT = -1, 0, 1
+CORNERS = 8
+"""Most corners of a cell's ends."""
+SPARE = 2 * CORNERS * ROWS
+"""Row of one end beside all cells."""
+EVEN = 0.1
+"""Part of a cell's height that a cut along an event must leave on either side; else it is halved."""
+
+_S15 = math.sqrt(15.0)
+_A, _B = (6.0 - _S15) / 21.0, (6.0 + _S15) / 21.0
+_POINTS = np.array(
+    [
+        [1 / 3, 1 / 3, 1 / 3],
+        [1 - 2 * _A, _A, _A], [_A, 1 - 2 * _A, _A], [_A, _A, 1 - 2 * _A],
+        [1 - 2 * _B, _B, _B], [_B, 1 - 2 * _B, _B], [_B, _B, 1 - 2 * _B],
+    ]
+)  # fmt: skip
+_HIGH = np.array([9 / 40, *[(155 - _S15) / 1200] * 3, *[(155 + _S15) / 1200] * 3])
+"""Radon's rule of seven points, exact to the fifth degree."""
+_LOW = np.array([1.0 - 0.25 / (1 - 3 * _A) ** 2, *[0.25 / (1 - 3 * _A) ** 2 / 3] * 3, 0.0, 0.0, 0.0])
+"""The rule of four of its points that is exact to the second degree."""
 
 
 def cell_workspace(occluders, room):
@@ -53,55 +68,64 @@ def cell_workspace(occluders, room):
     ``room`` is the number of corners that a part may have.
     """
     return (
-        np.empty((8 * ROWS, 3)),
-        np.empty((ROWS, 6), dtype=np.int64),
-        np.empty((ROWS, 4)),
+        np.empty((2 * CORNERS * ROWS + CORNERS, 3)),
+        np.empty((ROWS, 4), dtype=np.int64),
+        np.empty((ROWS, 2)),
         np.empty(32 * (occluders + 1) + 4096, dtype=np.int64),
-        np.empty((4, 4)),
+        np.empty(4),
         np.empty((PARTS + 1, room, 3)),
         np.empty(PARTS, dtype=np.int64),
     )
 
 
 @njit(**_PLAIN)
-def _halve(cells, source, size, short, first, second):
-    """Halve the polygon of three or four corners at row ``source``, to the rows ``first`` and ``second``.
-
-    Across its longer sides, or, of four, across its ``short`` ones.
-
-    Returns the number of corners of both halves.
-    """
-    if size == 3:
-        longest, turn = -1.0, 0
-        for k in range(3):
-            a, b = source + k, source + (k + 1) % 3
-            x, y, z = cells[b, 0] - cells[a, 0], cells[b, 1] - cells[a, 1], cells[b, 2] - cells[a, 2]
+def _middle_plane(cells, source, size):
+    """Plane (unnormalised normal, offset) that halves a polygon across where it is longest."""
+    farthest = -1.0
+    first = second = source
+    for i in range(source, source + size):
+        for j in range(i + 1, source + size):
+            x, y, z = cells[j, 0] - cells[i, 0], cells[j, 1] - cells[i, 1], cells[j, 2] - cells[i, 2]
             square = x * x + y * y + z * z
-            if square > longest:
-                longest, turn = square, k
-        a, b, c = source + turn, source + (turn + 1) % 3, source + (turn + 2) % 3
+            if square > farthest:
+                farthest, first, second = square, i, j
+    nx, ny, nz = (
+        cells[second, 0] - cells[first, 0], cells[second, 1] - cells[first, 1], cells[second, 2] - cells[first, 2]
+    )  # fmt: skip
+    mx, my, mz = (
+        0.5 * (cells[second, 0] + cells[first, 0]),
+        0.5 * (cells[second, 1] + cells[first, 1]),
+        0.5 * (cells[second, 2] + cells[first, 2]),
+    )
+    return nx, ny, nz, nx * mx + ny * my + nz * mz
+
+
+@njit(**_PLAIN)
+def _split(cells, source, size, nx, ny, nz, d, first, second):
+    """Cut the polygon at row ``source`` by a plane, to the rows ``first`` and ``second``; corners of both parts.
+
+    One that would get too many corners is cut along a diagonal instead.
+    """
+    polygon = cells[source : source + size]
+    front = clip_by_plane(polygon, size, nx, ny, nz, d, 0.0, cells[first : first + CORNERS])
+    back = clip_by_plane(polygon, size, -nx, -ny, -nz, -d, 0.0, cells[second : second + CORNERS])
+    if front >= 0 and back >= 0:
+        return front, back
+    middle = size // 2
+    for k in range(middle + 1):
         for axis in range(3):
-            p, q, r = cells[a, axis], cells[b, axis], cells[c, axis]
-            m = 0.5 * (p + q)
-            cells[first, axis], cells[first + 1, axis], cells[first + 2, axis] = p, m, r
-            cells[second, axis], cells[second + 1, axis], cells[second + 2, axis] = m, q, r
-        return 3
-    along = across = 0.0
-    for axis in range(3):
-        p, q, r, s = cells[source, axis], cells[source + 1, axis], cells[source + 2, axis], cells[source + 3, axis]
-        along += (q + r - p - s) ** 2
-        across += (r + s - p - q) ** 2
-    for axis in range(3):
-        p, q, r, s = cells[source, axis], cells[source + 1, axis], cells[source + 2, axis], cells[source + 3, axis]
-        if (along >= across) != short:
-            m, n = 0.5 * (p + q), 0.5 * (r + s)
-            cells[first, axis], cells[first + 1, axis], cells[first + 2, axis], cells[first + 3, axis] = p, m, n, s
-            cells[second, axis], cells[second + 1, axis], cells[second + 2, axis], cells[second + 3, axis] = m, q, r, n
-        else:
-            m, n = 0.5 * (q + r), 0.5 * (s + p)
-            cells[first, axis], cells[first + 1, axis], cells[first + 2, axis], cells[first + 3, axis] = p, q, m, n
-            cells[second, axis], cells[second + 1, axis], cells[second + 2, axis], cells[second + 3, axis] = n, m, r, s
-    return 4
+            cells[first + k, axis] = cells[source + k, axis]
+    for k in range(middle, size + 1):
+        for axis in range(3):
+            cells[second + k - middle, axis] = cells[source + (k if k < size else 0), axis]
+    return middle + 1, size - middle + 1
+
+
+@njit(**_PLAIN)
+def _area(cells, source, size):
+    """Area of a convex polygon."""
+    x, y, z = newell_normal(cells, source, source + size)
+    return math.sqrt(x * x + y * y + z * z)
 
 
 @njit(**_PLAIN)
@@ -124,7 +148,7 @@ def _between(
 
     Returns their number, -1 if one hides all.
     """
-    s0, t0 = 8 * row, 8 * row + 4
+    s0, t0 = 2 * CORNERS * row, 2 * CORNERS * row + CORNERS
     s1, t1 = s0 + numbers[row, 0], t0 + numbers[row, 1]
     sx, sy, sz, sr = _ball(cells, s0, numbers[row, 0])
     tx, ty, tz, tr = _ball(cells, t0, numbers[row, 1])
@@ -170,92 +194,178 @@ def _between(
 
 
 @njit(**_PLAIN)
-def _cell_value(
-    row, allowed, ns, nt, cells, numbers, arena, rule, kc, ks, kn, kd, through, fragments, sizes, weights, contour,
-    tally,
-):  # fmt: skip
-    """What the ends of a cell exchange past its candidates, the doubt of that or, if it is seen in part, what they
-    would exchange without, and how it was found.
-    """
-    s0, t0 = 8 * row, 8 * row + 4
-    size_s, size_t = numbers[row, 0], numbers[row, 1]
-    begin, many = numbers[row, 2], numbers[row, 3]
-    if many > SHORT:
-        return 0.0, 0.0, UNKNOWN
-    corners = _cell_points(cells[s0 : s0 + 4], size_s == 4, rule)
-    total = 0.0
-    if many == 0:
-        tally[CLOSED] += 1
-        sx, sy, sz, sr = _ball(cells, s0, size_s)
-        tx, ty, tz, tr = _ball(cells, t0, size_t)
-        gap = math.sqrt((tx - sx) ** 2 + (ty - sy) ** 2 + (tz - sz) ** 2) - tr
-        if gap > 4.0 * sr:
-            for p in range(corners):
-                total += rule[p, 3] * max(
-                    lambert_piece(rule[p, 0], rule[p, 1], rule[p, 2], ns[0], ns[1], ns[2], cells, t0, t0 + size_t), 0.0
-                )
-            # The rule's error falls with the fourth power, or the third on triangles.
-            doubt = 0.1 * total * (sr / gap) ** size_s
-            if doubt <= 0.1 * allowed:
-                return total, doubt, EXACT
-        value, rounding = contour_integral_in(
-            cells[s0 : s0 + size_s], size_s, cells[t0 : t0 + size_t], size_t, 0.1 * allowed, contour
-        )
-        return value, rounding + 0.1 * allowed, EXACT
-    tally[COMPLEX] += 1
-    sx, sy, sz, sr = _ball(cells, s0, size_s)
-    above = abs(nt[0] * (sx - cells[t0, 0]) + nt[1] * (sy - cells[t0, 1]) + nt[2] * (sz - cells[t0, 2]))
-    d = nt[0] * cells[t0, 0] + nt[1] * cells[t0, 1] + nt[2] * cells[t0, 2]
-    whole = 0.0
-    for p in range(corners):
-        if nt[0] * rule[p, 0] + nt[1] * rule[p, 1] + nt[2] * rule[p, 2] <= d:
-            continue
-        share = seen_share(
-            rule[p, 0], rule[p, 1], rule[p, 2], ns[0], ns[1], ns[2], cells, t0, t0 + size_t, kc, ks, kn, kd, through,
-            arena[begin : begin + many], many, fragments, sizes, weights, tally,
-        )  # fmt: skip
-        if share < 0.0:
-            return 0.0, 0.0, UNKNOWN
-        total += rule[p, 3] * share
-        whole += rule[p, 3] * lambert_piece(
-            rule[p, 0], rule[p, 1], rule[p, 2], ns[0], ns[1], ns[2], cells, t0, t0 + size_t
-        )
-    if above < CLOSE * sr:
-        # So close the rule does not know the whole well; what is hidden of it is smoother than what is seen.
-        clear, _ = contour_integral_in(
-            cells[s0 : s0 + size_s], size_s, cells[t0 : t0 + size_t], size_t, 0.1 * allowed, contour
-        )
-        return max(clear - max(whole - total, 0.0), 0.0), clear, ROUGH
-    return total, whole, ROUGH
+def _depth(cells, s0, s1, nx, ny, nz, d, tiny):
+    """Part of the height of a polygon over a plane that lies on its shorter side; 0 if it is not cut."""
+    lo, hi = _heights(nx, ny, nz, d, cells, s0, s1)
+    if lo >= -tiny or hi <= tiny:
+        return 0.0
+    return min(hi, -lo) / (hi - lo)
 
 
 @njit(**_PLAIN)
-def _may_be_missed(row, allowed, cells, numbers, values, arena, flow, fhigh, klow, khigh):
-    """Whether a candidate's shadow may lie between the points of a cell: narrower than it, with a narrow penumbra."""
-    s0, t0 = 8 * row, 8 * row + 4
-    sx, sy, sz, sr = _ball(cells, s0, numbers[row, 0])
-    tx, ty, tz, tr = _ball(cells, t0, numbers[row, 1])
-    far = math.sqrt((tx - sx) ** 2 + (ty - sy) ** 2 + (tz - sz) ** 2)
-    # Over so much of a candidate's distance the penumbra of the cell's other end spreads.
-    wide = min(2.0 * tr / far, 1.0) if far > 0.0 else 1.0
+def _beside(cells, s0, s1, nx, ny, nz, ux, uy, uz, vx, vy, vz, px, py, pz):
+    """Whether a polygon lies beside the cone from (px, py, pz) between u and v, in whose plane n stands."""
+    wx, wy, wz = ny * uz - nz * uy, nz * ux - nx * uz, nx * uy - ny * ux
+    sign = 1.0 if wx * vx + wy * vy + wz * vz > 0.0 else -1.0
+    outside = True
+    for i in range(s0, s1):
+        if sign * (wx * (cells[i, 0] - px) + wy * (cells[i, 1] - py) + wz * (cells[i, 2] - pz)) > 0.0:
+            outside = False
+            break
+    return outside
+
+
+@njit(**_PLAIN)
+def _event(cells, row, numbers, arena, kc, ks, kn, kd, slack, plane):
+    """The plane in which what a cell's end sees of the other changes its form, and which cuts it most evenly.
+
+    An edge of a candidate with a corner of the other end, an edge of that with a corner of the candidate, a
+    candidate's own plane (the EV events of discontinuity meshing).  Returns the part of the cell's height that
+    lies on the shorter side, 0 if no such plane cuts it.
+    """
+    s0, t0 = 2 * CORNERS * row, 2 * CORNERS * row + CORNERS
+    s1, t1 = s0 + numbers[row, 0], t0 + numbers[row, 1]
+    best = 0.0
     for c in range(numbers[row, 2], numbers[row, 2] + numbers[row, 3]):
         k = arena[c]
-        width = min(fhigh[k, 0] - flow[k, 0], fhigh[k, 1] - flow[k, 1])
-        if width > NARROW * sr or values[row, 3] * width <= allowed * sr:
-            continue
-        gx = max(klow[k, 0] - sx, 0.0, sx - khigh[k, 0])
-        gy = max(klow[k, 1] - sy, 0.0, sy - khigh[k, 1])
-        gz = max(klow[k, 2] - sz, 0.0, sz - khigh[k, 2])
-        if wide * math.sqrt(gx * gx + gy * gy + gz * gz) < NARROW * sr:
-            return True
-    return False
+        lo, hi = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], cells, t0, t1)
+        if lo < 0.0 and hi > 0.0:
+            depth = _depth(cells, s0, s1, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], slack)
+            if depth > best:
+                best = depth
+                plane[0], plane[1], plane[2], plane[3] = kn[k, 0], kn[k, 1], kn[k, 2], kd[k]
+        for edge in range(2):
+            # Edges of the candidate with corners of the other end, then the other way round.
+            e0, e1 = (ks[k], ks[k + 1]) if edge == 0 else (t0, t1)
+            p0, p1 = (t0, t1) if edge == 0 else (ks[k], ks[k + 1])
+            edges, apexes = (kc, cells) if edge == 0 else (cells, kc)
+            for p in range(p0, p1):
+                px, py, pz = apexes[p, 0], apexes[p, 1], apexes[p, 2]
+                for e in range(e0, e1):
+                    m = e + 1 if e + 1 < e1 else e0
+                    ux, uy, uz = edges[e, 0] - px, edges[e, 1] - py, edges[e, 2] - pz
+                    vx, vy, vz = edges[m, 0] - px, edges[m, 1] - py, edges[m, 2] - pz
+                    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+                    square = nx * nx + ny * ny + nz * nz
+                    if square <= 1e-24 * (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz):
+                        continue
+                    d = nx * px + ny * py + nz * pz
+                    depth = _depth(cells, s0, s1, nx, ny, nz, d, slack * math.sqrt(square))
+                    if depth <= best:
+                        continue
+                    if edge == 1:
+                        # Seen through the candidate's corner the edge lies on the other side.
+                        ux, uy, uz, vx, vy, vz = -ux, -uy, -uz, -vx, -vy, -vz
+                    if _beside(cells, s0, s1, nx, ny, nz, ux, uy, uz, vx, vy, vz, px, py, pz) or _beside(
+                        cells, s0, s1, nx, ny, nz, vx, vy, vz, ux, uy, uz, px, py, pz
+                    ):
+                        continue
+                    best = depth
+                    plane[0], plane[1], plane[2], plane[3] = nx, ny, nz, d
+    return best
 
 
 @njit(**_PLAIN)
-def _move(cells, numbers, values, source, target):
-    for k in range(8):
+def _clear_value(cells, row, numbers, ns, allowed, contour, tally):
+    """What the ends of a cell exchange with nothing between them, and the error of that."""
+    s0, t0 = 2 * CORNERS * row, 2 * CORNERS * row + CORNERS
+    size_s, size_t = numbers[row, 0], numbers[row, 1]
+    tally[CLOSED] += 1
+    sx, sy, sz, sr = _ball(cells, s0, size_s)
+    tx, ty, tz, tr = _ball(cells, t0, size_t)
+    gap = math.sqrt((tx - sx) ** 2 + (ty - sy) ** 2 + (tz - sz) ** 2) - tr
+    if gap > 4.0 * sr:
+        total = off = 0.0
+        for part in range(1, size_s - 1):
+            high = low = 0.0
+            area = _part_area(cells, s0, part)
+            for p in range(7):
+                x, y, z = _part_point(cells, s0, part, p)
+                value = max(lambert_piece(x, y, z, ns[0], ns[1], ns[2], cells, t0, t0 + size_t), 0.0)
+                high += _HIGH[p] * value
+                low += _LOW[p] * value
+            total += area * high
+            off += area * abs(high - low) * (sr / gap)
+        if off <= 0.1 * allowed:
+            return total, off
+    value, rounding = contour_integral_in(
+        cells[s0 : s0 + size_s], size_s, cells[t0 : t0 + size_t], size_t, 0.1 * allowed, contour
+    )
+    return value, rounding + 0.1 * allowed
+
+
+@njit(**_PLAIN)
+def _part_area(cells, s0, part):
+    """Area of a triangle of a polygon's fan."""
+    ax, ay, az = cells[s0, 0], cells[s0, 1], cells[s0, 2]
+    b, c = s0 + part, s0 + part + 1
+    ux, uy, uz = cells[b, 0] - ax, cells[b, 1] - ay, cells[b, 2] - az
+    vx, vy, vz = cells[c, 0] - ax, cells[c, 1] - ay, cells[c, 2] - az
+    px, py, pz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    return 0.5 * math.sqrt(px * px + py * py + pz * pz)
+
+
+@njit(**_PLAIN)
+def _part_point(cells, s0, part, p):
+    """A point of the rule on a triangle of a polygon's fan."""
+    b, c = s0 + part, s0 + part + 1
+    u, v = _POINTS[p, 1], _POINTS[p, 2]
+    w = 1.0 - u - v
+    return (
+        w * cells[s0, 0] + u * cells[b, 0] + v * cells[c, 0],
+        w * cells[s0, 1] + u * cells[b, 1] + v * cells[c, 1],
+        w * cells[s0, 2] + u * cells[b, 2] + v * cells[c, 2],
+    )
+
+
+@njit(**_PLAIN)
+def _cell_value(
+    row, allowed, ns, nt, cells, numbers, arena, kc, ks, kn, kd, through, fragments, sizes, weights, contour, tally,
+):  # fmt: skip
+    """What the ends of a cell exchange past its candidates, the error of that, and whether there was room."""
+    s0, t0 = 2 * CORNERS * row, 2 * CORNERS * row + CORNERS
+    size_s, size_t = numbers[row, 0], numbers[row, 1]
+    begin, many = numbers[row, 2], numbers[row, 3]
+    tally[COMPLEX] += 1
+    sx, sy, sz, sr = _ball(cells, s0, size_s)
+    d = nt[0] * cells[t0, 0] + nt[1] * cells[t0, 1] + nt[2] * cells[t0, 2]
+    # So close the rule does not know the whole well; what is hidden of it is smoother than what is seen.
+    close = abs(nt[0] * sx + nt[1] * sy + nt[2] * sz - d) < CLOSE * sr
+    total = off = 0.0
+    for part in range(1, size_s - 1):
+        high = low = 0.0
+        area = _part_area(cells, s0, part)
+        for p in range(7):
+            x, y, z = _part_point(cells, s0, part, p)
+            if nt[0] * x + nt[1] * y + nt[2] * z <= d:
+                continue
+            share = seen_share(
+                x, y, z, ns[0], ns[1], ns[2], cells, t0, t0 + size_t, kc, ks, kn, kd, through,
+                arena[begin : begin + many], many, fragments, sizes, weights, tally,
+            )  # fmt: skip
+            if share < 0.0:
+                return 0.0, 0.0, False
+            if close:
+                whole = lambert_piece(x, y, z, ns[0], ns[1], ns[2], cells, t0, t0 + size_t)
+                share = max(whole - share, 0.0)
+            high += _HIGH[p] * share
+            low += _LOW[p] * share
+        total += area * high
+        off += area * abs(high - low)
+    if close:
+        clear, rounding = contour_integral_in(
+            cells[s0 : s0 + size_s], size_s, cells[t0 : t0 + size_t], size_t, 0.1 * allowed, contour
+        )
+        return max(clear - total, 0.0), off + rounding + 0.1 * allowed, True
+    return total, off, True
+
+
+@njit(**_PLAIN)
+def _copy(cells, numbers, values, source, target):
+    """Copy a cell to another row."""
+    for k in range(2 * CORNERS):
         for axis in range(3):
-            cells[8 * target + k, axis] = cells[8 * source + k, axis]
+            cells[2 * CORNERS * target + k, axis] = cells[2 * CORNERS * source + k, axis]
     for k in range(numbers.shape[1]):
         numbers[target, k] = numbers[source, k]
     for k in range(values.shape[1]):
@@ -264,8 +374,8 @@ def _move(cells, numbers, values, source, target):
 
 @njit(**_PLAIN)
 def _fan(ring, count, part, ox, oy, oz, cells, target):
-    """Part of a convex ring, whole if it has three or four corners, else a triangle of its fan; its corners."""
-    if count <= 4:
+    """Part of a convex ring, whole if it has few corners, else a triangle of its fan; its corners."""
+    if count <= CORNERS:
         for k in range(count):
             cells[target + k, 0], cells[target + k, 1], cells[target + k, 2] = (
                 ring[k, 0] + ox, ring[k, 1] + oy, ring[k, 2] + oz,
@@ -428,10 +538,10 @@ def refined_exchange(
         parts,
         part_sizes,
     )
-    fans_t = 1 if count_t <= 4 else count_t - 2
+    fans_t = 1 if count_t <= CORNERS else count_t - 2
     cells_s = 0
     for cut in range(cuts):
-        cells_s += 1 if part_sizes[cut] <= 4 else part_sizes[cut] - 2
+        cells_s += 1 if part_sizes[cut] <= CORNERS else part_sizes[cut] - 2
     share = tolerance / math.sqrt(cells_s * fans_t)
     total = doubt = 0.0
     made = 0
@@ -439,124 +549,92 @@ def refined_exchange(
     for number in range(cells_s * fans_t):
         if number % fans_t == 0 and number > 0:
             part += 1
-            if part >= (1 if part_sizes[cut] <= 4 else part_sizes[cut] - 2):
+            if part >= (1 if part_sizes[cut] <= CORNERS else part_sizes[cut] - 2):
                 cut, part = cut + 1, 0
+        # Row -> corners of both ends, candidates (first and number), depth; share of the error allowed, error of what
+        # it came from.
         numbers[0, 0] = _fan(parts[cut], part_sizes[cut], part, 0.0, 0.0, 0.0, cells, 0)
-        numbers[0, 1] = _fan(pair[ring_t], count_t, number % fans_t, ox, oy, oz, cells, 4)
-        # Row -> its candidates (first and number); value, share of the error allowed, error of what it came from.
-        numbers[0, 2], numbers[0, 3], numbers[0, 4], numbers[0, 5] = 0, root, UNKNOWN, 0
-        values[0, 0], values[0, 1], values[0, 2] = 0.0, share, math.inf
-        if 2 * root > arena.shape[0]:
-            return 0.0, 0.0, False
-        left = _between(
-            cells, 0, numbers, arena, 0, root, root, kc, ks, kn, kd, through, frame, flat, flow, fhigh, slack, points,
-            tally,
-        )  # fmt: skip
-        if left < 0:
-            tally[DARK] += 1
-            continue
-        numbers[0, 2], numbers[0, 3] = root, left
-        value, off, state = _cell_value(
-            0, share, ns, nt, cells, numbers, arena, rule, kc, ks, kn, kd, through, fragments, sizes, weights,
-            contour, tally,
-        )  # fmt: skip
-        if state == EXACT:
-            total, doubt = total + value, doubt + off
-            continue
-        values[0, 0], values[0, 3], numbers[0, 4] = value, off, state
+        numbers[0, 1] = _fan(pair[ring_t], count_t, number % fans_t, ox, oy, oz, cells, CORNERS)
+        numbers[0, 2], numbers[0, 3] = 0, root
+        values[0, 0], values[0, 1] = share, math.inf
         top = 0
         while top >= 0:
             made += 1
-            if made > MOST_CELLS or top + 3 > ROWS:
-                # No more: what waits counts as it is.
-                for row in range(top + 1):
-                    if numbers[row, 4] == UNKNOWN:
-                        return total, doubt, False
-                    total += values[row, 0]
-                    doubt += min(values[row, 2], 0.5 * values[row, 3])
-                break
-            size_s, size_t = numbers[top, 0], numbers[top, 1]
-            s0, t0 = 8 * top, 8 * top + 4
-            of_target = False
-            if numbers[top, 4] == UNKNOWN:
-                _, _, _, rs = _ball(cells, s0, size_s)
-                _, _, _, rt = _ball(cells, t0, size_t)
-                of_target = rt > rs
             free = numbers[top, 2] + numbers[top, 3]
-            if free + 2 * numbers[top, 3] > arena.shape[0]:
+            if free + numbers[top, 3] > arena.shape[0] or top + 2 > ROWS:
                 return total, doubt, False
-            for half in range(2):
-                row = top + 1 + half
-                for c in range(8):
-                    for axis in range(3):
-                        cells[8 * row + c, axis] = cells[s0 + c, axis]
-                numbers[row, 0], numbers[row, 1] = size_s, size_t
-                numbers[row, 5] = numbers[top, 5] + (0 if of_target else 1)
-            shift = 4 if of_target else 0
-            # A long cell may be smooth along and not across: the first look is across.
-            depth = numbers[top, 5]
-            _halve(
-                cells, s0 + shift, size_t if of_target else size_s, not of_target and depth == 0, s0 + 8 + shift,
-                s0 + 16 + shift,
+            left = _between(
+                cells, top, numbers, arena, numbers[top, 2], numbers[top, 3], free, kc, ks, kn, kd, through, frame,
+                flat, flow, fhigh, slack, points, tally,
             )  # fmt: skip
-            allowed = values[top, 1] * 0.7071067811865476
-            both = dim = 0.0
-            rough = 0
-            unknown = numbers[top, 4] == UNKNOWN
-            for half in range(2):
-                row = top + 1 + half
-                left = _between(
-                    cells, row, numbers, arena, numbers[top, 2], numbers[top, 3], free, kc, ks, kn, kd, through, frame,
-                    flat, flow, fhigh, slack, points, tally,
-                )  # fmt: skip
-                if left < 0:
-                    tally[DARK] += 1
-                    numbers[row, 4], values[row, 0] = EXACT, 0.0
-                    continue
-                numbers[row, 2], numbers[row, 3] = free, left
-                value, off, state = _cell_value(
-                    row, allowed, ns, nt, cells, numbers, arena, rule, kc, ks, kn, kd, through, fragments, sizes,
-                    weights, contour, tally,
-                )  # fmt: skip
-                free += left
-                numbers[row, 4], values[row, 0], values[row, 3] = state, value, off
-                if state == EXACT:
-                    doubt += off
-                unknown = unknown or state == UNKNOWN
-                rough += state != EXACT
-                both += value
-                if state == ROUGH:
-                    dim += off
-            error = math.inf
-            if not unknown:
-                # Halves may agree with the whole by chance: at once no more than so much is gained.
-                before = values[top, 2] if values[top, 2] < math.inf else 2.0 * max(both, values[top, 0])
-                error = max(0.4 * abs(both - values[top, 0]), 0.15 * before)
-                if both + values[top, 0] <= 0.0 and numbers[top, 3] == 1:
-                    # No point sees past the one occluder that is left, and nothing proves that none can: a rim may
-                    # lie open between them.  (Several may well hide all together, which no halving proves.)
-                    error = UNSEEN * dim
-                if rough == 0:
-                    error = 0.0
-            if rough == 0 or (
-                error <= values[top, 1]
-                and depth > 0
-                and not _may_be_missed(top, values[top, 1], cells, numbers, values, arena, flow, fhigh, klow, khigh)
-            ):
-                total += both
-                doubt += error
+            if left < 0:
+                tally[DARK] += 1
                 top -= 1
                 continue
-            target = top
+            numbers[top, 2], numbers[top, 3] = free, left
+            allowed, before = values[top, 0], values[top, 1]
+            if left == 0:
+                value, off = _clear_value(cells, top, numbers, ns, allowed, contour, tally)
+                total, doubt = total + value, doubt + off
+                top -= 1
+                continue
+            s0, t0 = 2 * CORNERS * top, 2 * CORNERS * top + CORNERS
+            size_s, size_t = numbers[top, 0], numbers[top, 1]
+            sx, sy, sz, sr = _ball(cells, s0, size_s)
+            area = _area(cells, s0, size_s)
+            whole = area * max(lambert_piece(sx, sy, sz, ns[0], ns[1], ns[2], cells, t0, t0 + size_t), 0.0)
+            of_target = False
+            event = 0.0
+            error = math.inf
+            last = made > MOST_CELLS
+            if left > SHORT:
+                _, _, _, tr = _ball(cells, t0, size_t)
+                of_target = tr > sr
+            else:
+                event = _event(cells, top, numbers, arena, kc, ks, kn, kd, slack, rule)
+                # Where its form changes the rule's points may miss a part of what is seen.
+                missed = min(event, UNSEEN) * whole
+                if missed <= allowed or last:
+                    value, error, room = _cell_value(
+                        top, allowed, ns, nt, cells, numbers, arena, kc, ks, kn, kd, through, fragments, sizes,
+                        weights, contour, tally,
+                    )  # fmt: skip
+                    if not room:
+                        error = math.inf
+                    elif left > 1:
+                        # Several occluders make more such lines, which are not looked for.
+                        error = max(error, min(missed + 0.15 * before, UNSEEN * whole))
+                    error += missed
+            if error <= allowed or (last and error < math.inf):
+                total, doubt = total + value, doubt + error
+                top -= 1
+                continue
+            if last:
+                return total, doubt, False
+            _copy(cells, numbers, values, top, top + 1)
+            first = t0 if of_target else s0
+            size = size_t if of_target else size_s
+            if event > EVEN:
+                nx, ny, nz, d = rule[0], rule[1], rule[2], rule[3]
+            else:
+                nx, ny, nz, d = _middle_plane(cells, first, size)
+            # The source is overwritten: it is read from the copy's row.
+            one, two = _split(cells, first + 2 * CORNERS, size, nx, ny, nz, d, SPARE, first)
+            for k in range(one):
+                for axis in range(3):
+                    cells[first + 2 * CORNERS + k, axis] = cells[SPARE + k, axis]
+            column = 1 if of_target else 0
+            numbers[top, column], numbers[top + 1, column] = two, one
             for half in range(2):
-                row = top + 1 + half
-                if numbers[row, 4] == EXACT:
-                    total += values[row, 0]
-                    continue
-                values[row, 1] = allowed
-                values[row, 2] = error / rough
-                if row != target:
-                    _move(cells, numbers, values, row, target)
-                target += 1
-            top = target - 1
+                row = top + half
+                part_area = _area(cells, first + 2 * CORNERS * half, numbers[row, column])
+                fraction = min(max(part_area / area, 0.02), 1.0) if not of_target else 0.5
+                values[row, 0] = allowed * math.sqrt(fraction)
+                values[row, 1] = min(error, UNSEEN * whole)
+            top += 1
+            if one < 3:
+                top -= 1
+            elif two < 3:
+                _copy(cells, numbers, values, top, top - 1)
+                top -= 1
     return total, max(doubt, 1e-15 * total), True
