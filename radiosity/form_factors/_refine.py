@@ -29,8 +29,9 @@ SHORT = 48
 
 CLOSE = 1.0
 """Height over the other end, in radii of a cell, below which the closed form of the cell is worth its time."""
-UNSEEN = 0.03
-"""Share of a cell's open exchange that the points of its rule may miss where what is seen changes its form."""
+UNSEEN, VARIED = 0.03, 0.15
+"""Share of a cell's open exchange that the points of its rule may miss where what is seen changes its form and they do
+not; part of it that they may miss where they differ."""
 
 PARTS = 64
 """Most parts into which an end is cut beforehand, along what touches it."""
@@ -216,23 +217,49 @@ def _beside(cells, s0, s1, nx, ny, nz, ux, uy, uz, vx, vy, vz, px, py, pz):
 
 
 @njit(**_PLAIN)
-def _event(cells, row, numbers, arena, kc, ks, kn, kd, slack, plane):
-    """The plane in which what a cell's end sees of the other changes its form, and which cuts it most evenly.
+def _most_hidden(cells, row, numbers, nt, k, flow, fhigh, klow, khigh):
+    """Most of a cell's other end that a candidate may hide from any point of the cell, as a share: by solid angles."""
+    s0, t0 = 2 * CORNERS * row, 2 * CORNERS * row + CORNERS
+    sx, sy, sz, sr = _ball(cells, s0, numbers[row, 0])
+    tx, ty, tz, _ = _ball(cells, t0, numbers[row, 1])
+    gx = max(klow[k, 0] - sx, 0.0, sx - khigh[k, 0])
+    gy = max(klow[k, 1] - sy, 0.0, sy - khigh[k, 1])
+    gz = max(klow[k, 2] - sz, 0.0, sz - khigh[k, 2])
+    gap = math.sqrt(gx * gx + gy * gy + gz * gz) - sr
+    if gap <= 0.0:
+        return 1.0
+    dx, dy, dz = sx - tx, sy - ty, sz - tz
+    square = dx * dx + dy * dy + dz * dz
+    height = max(nt[0] * dx + nt[1] * dy + nt[2] * dz, 0.0)
+    # area / gap^2 of the candidate over area cos / distance^2 of the end.
+    width = (fhigh[k, 0] - flow[k, 0]) * (fhigh[k, 1] - flow[k, 1])
+    seen = gap * gap * _area(cells, t0, numbers[row, 1]) * height
+    return min(1.0, width * square * math.sqrt(square) / seen) if seen > 0.0 else 1.0
+
+
+@njit(**_PLAIN)
+def _event(cells, row, numbers, nt, arena, kc, ks, kn, kd, flow, fhigh, klow, khigh, slack, plane):
+    """The plane in which what a cell's end sees of the other changes its form that matters most to the cell.
 
     An edge of a candidate with a corner of the other end, an edge of that with a corner of the candidate, a
     candidate's own plane (the EV events of discontinuity meshing).  Returns the part of the cell's height that
-    lies on the shorter side, 0 if no such plane cuts it.
+    lies on the shorter side, 0 if no such plane cuts it, and the share of what is seen that the points of the
+    cell's rule may miss for it.
     """
     s0, t0 = 2 * CORNERS * row, 2 * CORNERS * row + CORNERS
     s1, t1 = s0 + numbers[row, 0], t0 + numbers[row, 1]
-    best = 0.0
+    depth = missed = 0.0
     for c in range(numbers[row, 2], numbers[row, 2] + numbers[row, 3]):
         k = arena[c]
+        most = _most_hidden(cells, row, numbers, nt, k, flow, fhigh, klow, khigh)
+        if most * UNSEEN <= missed:
+            continue
+        best = 0.0
         lo, hi = _heights(kn[k, 0], kn[k, 1], kn[k, 2], kd[k], cells, t0, t1)
         if lo < 0.0 and hi > 0.0:
-            depth = _depth(cells, s0, s1, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], slack)
-            if depth > best:
-                best = depth
+            best = _depth(cells, s0, s1, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], slack)
+            if best > 0.0 and min(best, UNSEEN) * most > missed:
+                depth, missed = best, min(best, UNSEEN) * most
                 plane[0], plane[1], plane[2], plane[3] = kn[k, 0], kn[k, 1], kn[k, 2], kd[k]
         for edge in range(2):
             # Edges of the candidate with corners of the other end, then the other way round.
@@ -250,8 +277,8 @@ def _event(cells, row, numbers, arena, kc, ks, kn, kd, slack, plane):
                     if square <= 1e-24 * (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz):
                         continue
                     d = nx * px + ny * py + nz * pz
-                    depth = _depth(cells, s0, s1, nx, ny, nz, d, slack * math.sqrt(square))
-                    if depth <= best:
+                    cut = _depth(cells, s0, s1, nx, ny, nz, d, slack * math.sqrt(square))
+                    if cut <= best:
                         continue
                     if edge == 1:
                         # Seen through the candidate's corner the edge lies on the other side.
@@ -260,9 +287,11 @@ def _event(cells, row, numbers, arena, kc, ks, kn, kd, slack, plane):
                         cells, s0, s1, nx, ny, nz, vx, vy, vz, ux, uy, uz, px, py, pz
                     ):
                         continue
-                    best = depth
-                    plane[0], plane[1], plane[2], plane[3] = nx, ny, nz, d
-    return best
+                    best = cut
+                    if min(best, UNSEEN) * most >= missed:
+                        depth, missed = best, min(best, UNSEEN) * most
+                        plane[0], plane[1], plane[2], plane[3] = nx, ny, nz, d
+    return depth, missed
 
 
 @njit(**_PLAIN)
@@ -322,7 +351,9 @@ def _part_point(cells, s0, part, p):
 def _cell_value(
     row, allowed, ns, nt, cells, numbers, arena, kc, ks, kn, kd, through, fragments, sizes, weights, contour, tally,
 ):  # fmt: skip
-    """What the ends of a cell exchange past its candidates, the error of that, and whether there was room."""
+    """What the ends of a cell exchange past its candidates, the error of that, how far the visible shares of its points
+    lie apart, and whether there was room.
+    """
     s0, t0 = 2 * CORNERS * row, 2 * CORNERS * row + CORNERS
     size_s, size_t = numbers[row, 0], numbers[row, 1]
     begin, many = numbers[row, 2], numbers[row, 3]
@@ -332,6 +363,7 @@ def _cell_value(
     # So close the rule does not know the whole well; what is hidden of it is smoother than what is seen.
     close = abs(nt[0] * sx + nt[1] * sy + nt[2] * sz - d) < CLOSE * sr
     total = off = 0.0
+    least, most = 1.0, 0.0
     for part in range(1, size_s - 1):
         high = low = 0.0
         area = _part_area(cells, s0, part)
@@ -344,9 +376,11 @@ def _cell_value(
                 arena[begin : begin + many], many, fragments, sizes, weights, tally,
             )  # fmt: skip
             if share < 0.0:
-                return 0.0, 0.0, False
+                return 0.0, 0.0, 0.0, False
+            whole = lambert_piece(x, y, z, ns[0], ns[1], ns[2], cells, t0, t0 + size_t)
+            if whole > 0.0:
+                least, most = min(least, share / whole), max(most, share / whole)
             if close:
-                whole = lambert_piece(x, y, z, ns[0], ns[1], ns[2], cells, t0, t0 + size_t)
                 share = max(whole - share, 0.0)
             high += _HIGH[p] * share
             low += _LOW[p] * share
@@ -356,8 +390,8 @@ def _cell_value(
         clear, rounding = contour_integral_in(
             cells[s0 : s0 + size_s], size_s, cells[t0 : t0 + size_t], size_t, 0.1 * allowed, contour
         )
-        return max(clear - total, 0.0), off + rounding + 0.1 * allowed, True
-    return total, off, True
+        return max(clear - total, 0.0), off + rounding + 0.1 * allowed, max(most - least, 0.0), True
+    return total, off, max(most - least, 0.0), True
 
 
 @njit(**_PLAIN)
@@ -557,6 +591,7 @@ def refined_exchange(
         numbers[0, 1] = _fan(pair[ring_t], count_t, number % fans_t, ox, oy, oz, cells, CORNERS)
         numbers[0, 2], numbers[0, 3] = 0, root
         values[0, 0], values[0, 1] = share, math.inf
+        all_area = _area(cells, 0, numbers[0, 0])
         top = 0
         while top >= 0:
             made += 1
@@ -591,20 +626,23 @@ def refined_exchange(
                 _, _, _, tr = _ball(cells, t0, size_t)
                 of_target = tr > sr
             else:
-                event = _event(cells, top, numbers, arena, kc, ks, kn, kd, slack, rule)
+                event, missed = _event(
+                    cells, top, numbers, nt, arena, kc, ks, kn, kd, flow, fhigh, klow, khigh, slack, rule
+                )
                 # Where its form changes the rule's points may miss a part of what is seen.
-                missed = min(event, UNSEEN) * whole
-                if missed <= allowed or last:
-                    value, error, room = _cell_value(
+                missed *= whole
+                if left > 1:
+                    # Of several, most such planes change nothing that is seen, and no halving rids a cell of all.
+                    missed *= math.sqrt(area / all_area)
+                if VARIED * missed <= allowed or last:
+                    value, error, apart, room = _cell_value(
                         top, allowed, ns, nt, cells, numbers, arena, kc, ks, kn, kd, through, fragments, sizes,
                         weights, contour, tally,
                     )  # fmt: skip
                     if not room:
                         error = math.inf
-                    elif left > 1:
-                        # Several occluders make more such lines, which are not looked for.
-                        error = max(error, min(missed + 0.15 * before, UNSEEN * whole))
-                    error += missed
+                    # Points that differ see the most of what there is.
+                    error = max(error, max(VARIED, 1.0 - 4.0 * apart) * missed)
             if error <= allowed or (last and error < math.inf):
                 total, doubt = total + value, doubt + error
                 top -= 1
