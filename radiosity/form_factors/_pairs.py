@@ -611,12 +611,13 @@ def _sampled(
 
 @njit(**_PLAIN)
 def partial_share(
-    i, j, far, goal, first, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, many,
-    fragments, sizes, weights, sums, tally,
+    i, j, far, goal, first, levels, missed, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept,
+    many, fragments, sizes, weights, sums, tally,
 ):  # fmt: skip
     """Visible share of the exchange of two pieces and the estimate of its error; -1 if rays must tell.
 
-    Points of ever finer rules on piece i, until two in a row agree to ``goal``; ``far`` as in the caller.
+    Points of ever finer rules on piece i, until two in a row agree to ``goal``; ``far`` as in the caller.  ``missed``
+    over the points of the first rule is what they may miss of the share though they agree.
     """
     before, doubt = -1.0, 1.0
     share = 0.0
@@ -637,7 +638,7 @@ def partial_share(
             # Of small triangles in a room; they know nothing of a shadow's edge between their middle and their rim.
             doubt = 0.055 if share <= 0.0 or share >= 1.0 else 0.07
         elif before < 0.0:
-            doubt = 0.2 * spread / math.sqrt(points) + 0.06 / points
+            doubt = 0.2 * spread / math.sqrt(points) + missed / points
         else:
             doubt = 0.25 * abs(share - before) + 0.18 * spread / points + 0.015 / points
         if doubt <= goal:

@@ -44,8 +44,8 @@ RAY_DOUBT = 0.1
 
 @njit(**_PLAIN)
 def _one_pair(
-    i, j, straddle, begin, many, arena, limit, error, share_error, floor, first, levels, reach, corners, start, normal,
-    offset, centroid, area, radius, low, high, group, rules, rule_starts, fine, fine_start, kc, ks, kn, kd, kg,
+    i, j, straddle, begin, many, arena, limit, error, share_error, floor, first, levels, missed, reach, corners, start,
+    normal, offset, centroid, area, radius, low, high, group, rules, rule_starts, fine, fine_start, kc, ks, kn, kd, kg,
     through, frame, flat, flow, fhigh, slack, fragments, sizes, weights, points, pair, kept, contour, sums, tally,
 ):  # fmt: skip
     """Exchange area of a pair, its error, and 1 if rays must scale it."""
@@ -133,14 +133,14 @@ def _one_pair(
     # Of small polygons far away the kernel at a fragment's centroid tells its share as well as Lambert's formula.
     far = not straddle and POINT_RULE * radius[t] * radius[t] < FAR_SHARE * goal * square
     share, uncertain = partial_share(
-        s, t, far, goal, first, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept, used,
-        fragments, sizes, weights, sums, tally,
+        s, t, far, goal, first, levels, missed, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept,
+        used, fragments, sizes, weights, sums, tally,
     )  # fmt: skip
     if uncertain == 1.0:
         # No point of the smaller sees the other at all (their planes cut both near an edge): look back.
         share, uncertain = partial_share(
-            t, s, False, goal, first, levels, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept,
-            used, fragments, sizes, weights, sums, tally,
+            t, s, False, goal, first, levels, missed, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through,
+            kept, used, fragments, sizes, weights, sums, tally,
         )  # fmt: skip
         if uncertain == 1.0 and share == 0.0:
             share, uncertain = 0.5, 0.5
@@ -252,7 +252,7 @@ def stripe(
     top, node_first, node_last, node_left, node_right, node_low, node_high, node_group, plane_normal, plane_offset,
     corners, start, normal, offset, centroid, area, radius, low, high, group, rules, rule_starts, fine, fine_start,
     kc, ks, kn, kd, kg, through, frame, flat, flow, fhigh, klow, khigh, slack, error, share_error, floor, first,
-    levels, reach, limit, importance, fragments, sizes, weights, points, pair, kept, contour, sums, cells, numbers,
+    levels, missed, reach, limit, importance, fragments, sizes, weights, points, pair, kept, contour, sums, cells, numbers,
     values, short, rule, parts, part_sizes, shaft, box, arena, stack, out, spread, flagged, threshold, tally,
 ):  # fmt: skip
     """Exchange areas of the pieces of node ``top`` with all pieces that come after each.
@@ -359,8 +359,8 @@ def stripe(
                     tally[LINK] += 1
                 else:
                     value, doubt, rays = _one_pair(
-                        i, j, straddle, begin, many, arena, limit, error, share_error, floor, first, levels, reach,
-                        corners, start, normal, offset, centroid, area, radius, low, high, group, rules, rule_starts,
+                        i, j, straddle, begin, many, arena, limit, error, share_error, floor, first, levels, missed,
+                        reach, corners, start, normal, offset, centroid, area, radius, low, high, group, rules, rule_starts,
                         fine, fine_start, kc, ks, kn, kd, kg, through, frame, flat, flow, fhigh, slack, fragments,
                         sizes, weights, points, pair, kept, contour, sums, tally,
                     )  # fmt: skip

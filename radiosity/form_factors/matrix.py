@@ -49,6 +49,8 @@ STRIPE = 48
 """Most pieces of a task: fixed, so that nothing depends on the number of workers."""
 LARGE = 600
 """Fewer rows than this are large polygons: longer candidate lists are cut, at more points."""
+MISSED_OF_FEW = 0.3
+"""Share of a large polygon, over the points of a rule, that they may miss though they agree."""
 COVERED = 0.01
 """Share of a row of a closed scene that must be missing to count as covered (the floor under a box)."""
 BLOCK_ROWS = 128
@@ -368,6 +370,7 @@ class _Care:
     floor: float
     first: int
     levels: int
+    missed: float
     limit: int
     reach: FloatArray
 
@@ -386,6 +389,8 @@ class _Care:
             # Few and large polygons have more in their shadows: they get a level more.
             first=first,
             levels=2 if loose and count < LARGE else (1, 2)[first] + sum(error < e for e in (1e-2, 3e-3, 4e-4, 5e-5)),
+            # A hundred thousand pairs do not all miss the same way; the few of a small scene may.
+            missed=MISSED_OF_FEW if loose and count < LARGE else 0.06,
             limit=min(12 if error > 5e-3 else 32 if count >= LARGE else _pairs.MAX_CUT, _pairs.MAX_CUT),
             reach=np.array([(factor / relative) ** (1.0 / power) for factor, power in rules]),
         )
@@ -438,7 +443,7 @@ class _Engine:
             points, level_starts, fine, fine_start,
             o.corners, o.start, o.normal, o.offset, o.group, o.through, frame, flat, flow, fhigh,
             *self._occluder_boxes, o.slack, care.error, care.share_error, care.floor, care.first, care.levels,
-            care.reach, care.limit,
+            care.missed, care.reach, care.limit,
         )  # fmt: skip
         self._corners = int(max(np.diff(p.start).max(), np.diff(o.start).max(initial=3), 8))
         self._idle: list[tuple[Any, ...]] = []
