@@ -50,7 +50,7 @@ def pair_workspace(max_corners, fragments=MAX_FRAGMENTS):
         np.empty((4, 2 * room, 3)),
         np.empty(MAX_CUT, dtype=np.int64),
         np.empty((CONTOUR_ROWS, 3)),
-        np.empty(4),
+        np.empty(5),
     )
 
 
@@ -573,7 +573,7 @@ def _sampled(
 ):  # fmt: skip
     """Visible and open form factors of piece j, summed over points of piece i; whether there was room.
 
-    ``sums``: visible, open, and the least and largest visible share.
+    ``sums``: visible, open, the least and largest visible share, and the number of points that see anything.
     """
     nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
     mx, my, mz = normal[j, 0], normal[j, 1], normal[j, 2]
@@ -581,6 +581,7 @@ def _sampled(
     d = mx * corners[t0, 0] + my * corners[t0, 1] + mz * corners[t0, 2]
     seen = whole = 0.0
     least, most = math.inf, 0.0
+    used = 0
     for p in range(p0, p1):
         x, y, z, w = points[p, 0], points[p, 1], points[p, 2], points[p, 3]
         if mx * x + my * y + mz * z - d <= 0.0:
@@ -601,11 +602,12 @@ def _sampled(
                 share += weights[f] * _fragment_flux(fragments, f, sizes[f], nx, ny, nz, mx, my, mz)
             else:
                 share += weights[f] * max(lambert_piece(0.0, 0.0, 0.0, nx, ny, nz, fragments[f], 0, sizes[f]), 0.0)
+        used += 1
         whole += w * clear
         seen += w * share
         part = share / clear
         least, most = min(least, part), max(most, part)
-    sums[0], sums[1], sums[2], sums[3] = seen, whole, least, most
+    sums[0], sums[1], sums[2], sums[3], sums[4] = seen, whole, least, most, used
     return True
 
 
@@ -638,7 +640,8 @@ def partial_share(
             # Of small triangles in a room; they know nothing of a shadow's edge between their middle and their rim.
             doubt = 0.055 if share <= 0.0 or share >= 1.0 else 0.07
         elif before < 0.0:
-            doubt = 0.2 * spread / math.sqrt(points) + missed / points
+            # Points below the other's horizon tell nothing.
+            doubt = 0.2 * spread / math.sqrt(sums[4]) + missed / sums[4]
         else:
             doubt = 0.25 * abs(share - before) + 0.18 * spread / points + 0.015 / points
         if doubt <= goal:

@@ -29,9 +29,11 @@ SHORT = 48
 
 CLOSE = 1.0
 """Height over the other end, in radii of a cell, below which the closed form of the cell is worth its time."""
-UNSEEN, VARIED = 0.03, 0.15
+UNSEEN = 0.03
 """Share of a cell's open exchange that the points of its rule may miss where what is seen changes its form and they do
-not; part of it that they may miss where they differ."""
+not."""
+FEW, VARIED = 4, 0.15
+"""Part of it that they may miss where they differ: half behind few candidates, less of more, whose events are many."""
 
 PARTS = 64
 """Most parts into which an end is cut beforehand, along what touches it."""
@@ -634,7 +636,8 @@ def refined_exchange(
                 if left > 1:
                     # Of several, most such planes change nothing that is seen, and no halving rids a cell of all.
                     missed *= math.sqrt(area / all_area)
-                if VARIED * missed <= allowed or last:
+                varied = VARIED if left > FEW else 0.5
+                if varied * missed <= allowed or last:
                     value, error, apart, room = _cell_value(
                         top, allowed, ns, nt, cells, numbers, arena, kc, ks, kn, kd, through, fragments, sizes,
                         weights, contour, tally,
@@ -642,7 +645,7 @@ def refined_exchange(
                     if not room:
                         error = math.inf
                     # Points that differ see the most of what there is.
-                    error = max(error, max(VARIED, 1.0 - 4.0 * apart) * missed)
+                    error = max(error, max(varied, 1.0 - 4.0 * apart) * missed)
             if error <= allowed or (last and error < math.inf):
                 total, doubt = total + value, doubt + error
                 top -= 1
