@@ -240,6 +240,22 @@ def _most_hidden(cells, row, numbers, nt, k, flow, fhigh, klow, khigh):
 
 
 @njit(**_PLAIN)
+def _distance(x, y, z, nx, ny, nz, d, corners, a, b):
+    """Lower bound on the distance of a point from a convex polygon whose plane has the normal n."""
+    off = 0.0
+    for i in range(a, b):
+        m = i + 1 if i + 1 < b else a
+        ex, ey, ez = corners[m, 0] - corners[i, 0], corners[m, 1] - corners[i, 1], corners[m, 2] - corners[i, 2]
+        px, py, pz = ey * nz - ez * ny, ez * nx - ex * nz, ex * ny - ey * nx
+        length = math.sqrt(px * px + py * py + pz * pz)
+        if length > 0.0:
+            beyond = px * (x - corners[i, 0]) + py * (y - corners[i, 1]) + pz * (z - corners[i, 2])
+            off = max(off, beyond / length)
+    height = nx * x + ny * y + nz * z - d
+    return math.sqrt(height * height + off * off)
+
+
+@njit(**_PLAIN)
 def _event(cells, row, numbers, nt, arena, kc, ks, kn, kd, flow, fhigh, klow, khigh, slack, plane):
     """The plane in which what a cell's end sees of the other changes its form that matters most to the cell.
 
@@ -251,6 +267,9 @@ def _event(cells, row, numbers, nt, arena, kc, ks, kn, kd, flow, fhigh, klow, kh
     s0, t0 = 2 * CORNERS * row, 2 * CORNERS * row + CORNERS
     s1, t1 = s0 + numbers[row, 0], t0 + numbers[row, 1]
     depth = missed = 0.0
+    x, y, z, radius = _ball(cells, s0, numbers[row, 0])
+    height = nt[0] * cells[t0, 0] + nt[1] * cells[t0, 1] + nt[2] * cells[t0, 2]
+    near = _distance(x, y, z, nt[0], nt[1], nt[2], height, cells, t0, t1) < radius
     for c in range(numbers[row, 2], numbers[row, 2] + numbers[row, 3]):
         k = arena[c]
         most = _most_hidden(cells, row, numbers, nt, k, flow, fhigh, klow, khigh)
@@ -293,6 +312,10 @@ def _event(cells, row, numbers, nt, arena, kc, ks, kn, kd, flow, fhigh, klow, kh
                     if min(best, UNSEEN) * most >= missed:
                         depth, missed = best, min(best, UNSEEN) * most
                         plane[0], plane[1], plane[2], plane[3] = nx, ny, nz, d
+        # So near both, the rule is coarse even where the form stays.
+        if near and most * UNSEEN > missed:
+            if _distance(x, y, z, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], kc, ks[k], ks[k + 1]) < radius:
+                missed = most * UNSEEN
     return depth, missed
 
 
