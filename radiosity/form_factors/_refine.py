@@ -667,8 +667,8 @@ def refined_exchange(
                     )  # fmt: skip
                     if not room:
                         error = math.inf
-                    # Points that differ see the most of what there is.
-                    error = max(error, max(varied, 1.0 - 4.0 * apart) * missed)
+                    # Points that differ a little see the most of what there is; much, that it may be a step.
+                    error = max(error, max(varied, 1.0 - 4.0 * apart, 3.0 * varied * apart) * missed)
             if error <= allowed or (last and error < math.inf):
                 total, doubt = total + value, doubt + error
                 top -= 1
