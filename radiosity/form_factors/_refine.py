@@ -1,9 +1,13 @@
-"""One pair of convex pieces to a wanted error, as kernels: both ends are halved where the pair's error is made.
+"""One pair of convex pieces to a wanted error, as kernels: both ends are cut where the pair's error is made.
 
 A cell is a part of each end.  Occluders that no longer come between its parts are dropped, so that most cells
 are soon clear (a closed form) or hidden; of the rest the part that is seen is cut exactly at the points of a
-rule, and halved until the halves agree with the whole.  Where the occluders are too many to cut by, the larger
-end is halved first: each half has fewer before it.
+rule.  What two rules on those points differ by tells the error of the quadrature, but not what all points miss:
+a rim, a slot, a thin layer.  That can be only where what is seen changes its form inside the cell (the EV events of
+D. Lischinski, F. Tampieri and D. P. Greenberg, "Discontinuity meshing for accurate radiosity", 1992), or where the
+cell is wide beside its distance; there a share of all that the cell may exchange counts as error, until the cell
+has been cut along its events.  Where the occluders are too many to cut by, the larger end is halved first: each half
+has fewer before it.
 """
 
 from __future__ import annotations
@@ -66,14 +70,14 @@ _LOW = np.array([1.0 - 0.25 / (1 - 3 * _A) ** 2, *[0.25 / (1 - 3 * _A) ** 2 / 3]
 
 
 def cell_workspace(occluders, room):
-    """Scratch of one thread: cells' corners (eight rows each), numbers, values, candidates, a rule; parts of an end.
+    """Scratch of one thread: cells' corners, numbers, allowed errors, candidates, a plane; parts of an end.
 
     ``room`` is the number of corners that a part may have.
     """
     return (
         np.empty((2 * CORNERS * ROWS + CORNERS, 3)),
         np.empty((ROWS, 4), dtype=np.int64),
-        np.empty((ROWS, 2)),
+        np.empty(ROWS),
         np.empty(32 * (occluders + 1) + 4096, dtype=np.int64),
         np.empty(4),
         np.empty((PARTS + 1, room, 3)),
@@ -313,9 +317,12 @@ def _event(cells, row, numbers, nt, arena, kc, ks, kn, kd, flow, fhigh, klow, kh
                         depth, missed = best, min(best, UNSEEN) * most
                         plane[0], plane[1], plane[2], plane[3] = nx, ny, nz, d
         # So near both, the rule is coarse even where the form stays.
-        if near and most * UNSEEN > missed:
-            if _distance(x, y, z, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], kc, ks[k], ks[k + 1]) < radius:
-                missed = most * UNSEEN
+        if (
+            near
+            and most * UNSEEN > missed
+            and _distance(x, y, z, kn[k, 0], kn[k, 1], kn[k, 2], kd[k], kc, ks[k], ks[k + 1]) < radius
+        ):
+            missed = most * UNSEEN
     return depth, missed
 
 
@@ -427,8 +434,7 @@ def _copy(cells, numbers, values, source, target):
             cells[2 * CORNERS * target + k, axis] = cells[2 * CORNERS * source + k, axis]
     for k in range(numbers.shape[1]):
         numbers[target, k] = numbers[source, k]
-    for k in range(values.shape[1]):
-        values[target, k] = values[source, k]
+    values[target] = values[source]
 
 
 @njit(**_PLAIN)
@@ -546,7 +552,7 @@ def _cut_along_touching(
 def refined_exchange(
     i, j, begin, many, given, tolerance, corners, start, normal, offset, radius, group, kc, ks, kn, kd, kg, through,
     frame, flat, flow, fhigh, klow, khigh, slack, fragments, sizes, weights, points, pair, contour, cells, numbers,
-    values, arena, rule, parts, part_sizes, tally,
+    values, arena, plane, parts, part_sizes, tally,
 ):  # fmt: skip
     """Exchange area of two pieces behind the occluders ``given[begin:begin + many]`` and the estimate of its error.
 
@@ -576,27 +582,9 @@ def refined_exchange(
         arena[root] = k
         root += 1
     cuts = _cut_along_touching(
-        pair[ring_s],
-        count_s,
-        ox,
-        oy,
-        oz,
-        ns,
-        nt,
-        offset[t],
-        kc,
-        ks,
-        kn,
-        kd,
-        klow,
-        khigh,
-        arena,
-        0,
-        root,
-        slack,
-        parts,
+        pair[ring_s], count_s, ox, oy, oz, ns, nt, offset[t], kc, ks, kn, kd, klow, khigh, arena, 0, root, slack, parts,
         part_sizes,
-    )
+    )  # fmt: skip
     fans_t = 1 if count_t <= CORNERS else count_t - 2
     cells_s = 0
     for cut in range(cuts):
@@ -610,12 +598,11 @@ def refined_exchange(
             part += 1
             if part >= (1 if part_sizes[cut] <= CORNERS else part_sizes[cut] - 2):
                 cut, part = cut + 1, 0
-        # Row -> corners of both ends, candidates (first and number), depth; share of the error allowed, error of what
-        # it came from.
+        # Row -> corners of both ends, candidates (first and number); share of the error allowed.
         numbers[0, 0] = _fan(parts[cut], part_sizes[cut], part, 0.0, 0.0, 0.0, cells, 0)
         numbers[0, 1] = _fan(pair[ring_t], count_t, number % fans_t, ox, oy, oz, cells, CORNERS)
         numbers[0, 2], numbers[0, 3] = 0, root
-        values[0, 0], values[0, 1] = share, math.inf
+        values[0] = share
         all_area = _area(cells, 0, numbers[0, 0])
         top = 0
         while top >= 0:
@@ -632,7 +619,7 @@ def refined_exchange(
                 top -= 1
                 continue
             numbers[top, 2], numbers[top, 3] = free, left
-            allowed, before = values[top, 0], values[top, 1]
+            allowed = values[top]
             if left == 0:
                 value, off = _clear_value(cells, top, numbers, ns, allowed, contour, tally)
                 total, doubt = total + value, doubt + off
@@ -642,6 +629,9 @@ def refined_exchange(
             size_s, size_t = numbers[top, 0], numbers[top, 1]
             sx, sy, sz, sr = _ball(cells, s0, size_s)
             area = _area(cells, s0, size_s)
+            if area <= 0.0:
+                top -= 1
+                continue
             whole = area * max(lambert_piece(sx, sy, sz, ns[0], ns[1], ns[2], cells, t0, t0 + size_t), 0.0)
             of_target = False
             event = 0.0
@@ -652,7 +642,7 @@ def refined_exchange(
                 of_target = tr > sr
             else:
                 event, missed = _event(
-                    cells, top, numbers, nt, arena, kc, ks, kn, kd, flow, fhigh, klow, khigh, slack, rule
+                    cells, top, numbers, nt, arena, kc, ks, kn, kd, flow, fhigh, klow, khigh, slack, plane
                 )
                 # Where its form changes the rule's points may miss a part of what is seen.
                 missed *= whole
@@ -679,7 +669,7 @@ def refined_exchange(
             first = t0 if of_target else s0
             size = size_t if of_target else size_s
             if event > EVEN:
-                nx, ny, nz, d = rule[0], rule[1], rule[2], rule[3]
+                nx, ny, nz, d = plane[0], plane[1], plane[2], plane[3]
             else:
                 nx, ny, nz, d = _middle_plane(cells, first, size)
             # The source is overwritten: it is read from the copy's row.
@@ -693,8 +683,7 @@ def refined_exchange(
                 row = top + half
                 part_area = _area(cells, first + 2 * CORNERS * half, numbers[row, column])
                 fraction = min(max(part_area / area, 0.02), 1.0) if not of_target else 0.5
-                values[row, 0] = allowed * math.sqrt(fraction)
-                values[row, 1] = min(error, UNSEEN * whole)
+                values[row] = allowed * math.sqrt(fraction)
             top += 1
             if one < 3:
                 top -= 1

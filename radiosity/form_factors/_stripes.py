@@ -133,14 +133,14 @@ def _one_pair(
     # Of small polygons far away the kernel at a fragment's centroid tells its share as well as Lambert's formula.
     far = not straddle and POINT_RULE * radius[t] * radius[t] < FAR_SHARE * goal * square
     share, uncertain = partial_share(
-        s, t, far, goal, first, levels, missed, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through, kept,
-        used, fragments, sizes, weights, sums, tally,
+        s, t, far, goal, first, levels, missed, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through,
+        kept, used, fragments, sizes, weights, sums, tally,
     )  # fmt: skip
     if uncertain == 1.0:
         # No point of the smaller sees the other at all (their planes cut both near an edge): look back.
         share, uncertain = partial_share(
-            t, s, False, goal, first, levels, missed, rules, rule_starts, corners, start, normal, kc, ks, kn, kd, through,
-            kept, used, fragments, sizes, weights, sums, tally,
+            t, s, False, goal, first, levels, missed, rules, rule_starts, corners, start, normal, kc, ks, kn, kd,
+            through, kept, used, fragments, sizes, weights, sums, tally,
         )  # fmt: skip
         if uncertain == 1.0 and share == 0.0:
             share, uncertain = 0.5, 0.5
@@ -252,8 +252,8 @@ def stripe(
     top, node_first, node_last, node_left, node_right, node_low, node_high, node_group, plane_normal, plane_offset,
     corners, start, normal, offset, centroid, area, radius, low, high, group, rules, rule_starts, fine, fine_start,
     kc, ks, kn, kd, kg, through, frame, flat, flow, fhigh, klow, khigh, slack, error, share_error, floor, first,
-    levels, missed, reach, limit, importance, fragments, sizes, weights, points, pair, kept, contour, sums, cells, numbers,
-    values, short, rule, parts, part_sizes, shaft, box, arena, stack, out, spread, flagged, threshold, tally,
+    levels, missed, reach, limit, importance, fragments, sizes, weights, points, pair, kept, contour, sums, cells,
+    numbers, values, short, plane, parts, part_sizes, shaft, box, arena, stack, out, spread, flagged, threshold, tally,
 ):  # fmt: skip
     """Exchange areas of the pieces of node ``top`` with all pieces that come after each.
 
@@ -360,9 +360,9 @@ def stripe(
                 else:
                     value, doubt, rays = _one_pair(
                         i, j, straddle, begin, many, arena, limit, error, share_error, floor, first, levels, missed,
-                        reach, corners, start, normal, offset, centroid, area, radius, low, high, group, rules, rule_starts,
-                        fine, fine_start, kc, ks, kn, kd, kg, through, frame, flat, flow, fhigh, slack, fragments,
-                        sizes, weights, points, pair, kept, contour, sums, tally,
+                        reach, corners, start, normal, offset, centroid, area, radius, low, high, group, rules,
+                        rule_starts, fine, fine_start, kc, ks, kn, kd, kg, through, frame, flat, flow, fhigh, slack,
+                        fragments, sizes, weights, points, pair, kept, contour, sums, tally,
                     )  # fmt: skip
                 weight = importance[i] + importance[j]
                 if threshold < math.inf and weight * max(doubt, RAY_DOUBT * value * rays) > threshold:
@@ -370,7 +370,7 @@ def stripe(
                     better, off, whole = refined_exchange(
                         i, j, begin, many, arena, threshold / weight, corners, start, normal, offset, radius, group, kc,
                         ks, kn, kd, kg, through, frame, flat, flow, fhigh, klow, khigh, slack, fragments, sizes,
-                        weights, points, pair, contour, cells, numbers, values, short, rule, parts, part_sizes, tally,
+                        weights, points, pair, contour, cells, numbers, values, short, plane, parts, part_sizes, tally,
                     )  # fmt: skip
                     if whole:
                         value, doubt, rays = better, off, 0
