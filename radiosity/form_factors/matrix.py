@@ -45,8 +45,9 @@ Matrix = Any
 
 LEAF = 8
 """Most pieces of a leaf of the tree of pairs."""
-STRIPE = 48
-"""Most pieces of a task: fixed, so that nothing depends on the number of workers."""
+STRIPE, SHORT_STRIPE = 48, 8
+"""Most pieces of a task, and of one in a scene of few large polygons, whose pairs take long: fixed, so that nothing
+depends on the number of workers."""
 LARGE = 600
 """Fewer rows than this are large polygons: longer candidate lists are cut, at more points."""
 MISSED_OF_FEW = 0.3
@@ -297,6 +298,7 @@ def _build_tree(pieces: _Pieces) -> tuple[_Tree, IntArray]:
     order: list[IntArray] = []
     stripes: list[int] = []
     placed = 0
+    widest = SHORT_STRIPE if STRIPE < pieces.count < LARGE else STRIPE
     # Entries: pieces, parent's row and column to fill in, whether a stripe lies above.
     stack: list[tuple[IntArray, int, int, bool]] = [(np.arange(pieces.count), -1, 0, False)]
     while stack:
@@ -307,7 +309,7 @@ def _build_tree(pieces: _Pieces) -> tuple[_Tree, IntArray]:
         planes = key[inside]
         single = bool((planes == planes[0]).all())
         nodes.append([placed, placed + len(inside), -1, -1, int(inside[0]) if single else -1])
-        if not striped and len(inside) <= STRIPE:
+        if not striped and len(inside) <= widest:
             stripes.append(row)
             striped = True
         if len(inside) <= LEAF:
