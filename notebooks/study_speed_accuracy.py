@@ -8,7 +8,9 @@
 # `radiosity chart` does the same from the command line, keeps a record that grows, and sets Mitsuba,
 # Radiance, pyViewFactor and trimesh on the same axes where they are installed.
 #
-# Seconds belong to a machine; the counts beside them do not.
+# Seconds belong to a machine; the counts beside them do not. Every setting runs several times, in mixed order, and
+# short ones often: the point is the median, its bar the spread. What the bars do not tell apart is a tie (a grey
+# ring), so that the order is the same when the notebook runs again.
 
 # %%
 import matplotlib.pyplot as plt

@@ -30,6 +30,7 @@ from workbench.record import write_text_atomically
 from workbench.scene.model import Scene
 
 if TYPE_CHECKING:
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 __all__ = [
@@ -578,8 +579,9 @@ def draw_chart(
         )  # fmt: skip
     for number, method in enumerate(dict.fromkeys(p.method for p in shown)):
         mine = [p for p in shown if p.method == method]
-        steep = slope([p.seconds for p in mine], [p.error for p in mine])
         kind = mine[0].kind
+        # What chooses itself changes its ways between settings, and follows no power.
+        steep = None if kind == "auto" else slope([p.seconds for p in mine], [p.error for p in mine])
         name = method + {"ours": "", "auto": " (chooses itself)", "rival": " (rival)"}[kind]
         text = name if steep is None else f"{name}, slope {steep:.2f}"
         colour = _COLOURS[number % len(_COLOURS)]
@@ -622,8 +624,22 @@ def draw_chart(
             "no error at all", (1.0, zero), xycoords=("axes fraction", "data"), xytext=(-3, 4),
             textcoords="offset points", ha="right", fontsize=8, color="0.4",
         )  # fmt: skip
+    _plain_ticks(axes.xaxis, *axes.get_xlim())
     axes.set_xlabel("seconds, median (bars: spread of the runs)")
     axes.set_ylabel(label)
     axes.set_title(title, fontsize=11)
     axes.grid(alpha=0.25, which="major")
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+
+
+def _plain_ticks(axis: Axis, low: float, high: float) -> None:
+    """Seconds in plain numbers, with 2 and 5 between where decades are few."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    axis.set_major_formatter(plain)
+    if high < 100.0 * low:
+        axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+        axis.set_minor_formatter(plain)
+    else:
+        axis.set_minor_formatter(NullFormatter())

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radiosity.report.metrics import resolution
-from radiosity.rivals import RIVALS, Rival, absent, open_rival
+from radiosity.rivals import RIVALS, Rival, open_rival
 from radiosity.rivals.base import black_lamps
 from radiosity.surface_grid import surface_grid
 from workbench.counters import Counters
@@ -543,7 +543,7 @@ class Solve(Problem):
             if method != "hierarchical":  # which chooses better for itself
                 options["form_factor_error"] = min(2.0 * fine, 0.2)
             if method not in ("direct", "matrix"):  # which know no light left unshot
-                options["tolerance"] = min(0.01, fine)
+                options["tolerance"] = min(fine, 0.2)
             solution = self._solved(options, seed)
             if not gather:
                 return Answer(self._read(solution), dict(solution.record.counters))
@@ -837,8 +837,3 @@ def problem_for(what: str, scene: Scene, **options: Any) -> Problem:
     if what not in PROBLEMS:
         raise OptionError(f"what: found {what!r}, expected one of {', '.join(PROBLEMS)}")
     return PROBLEMS[what](scene, **options)
-
-
-def why_absent(name: str) -> str | None:
-    """Why a rival cannot run here; ``None`` for one that can and for techniques of our own."""
-    return absent(name) if name in RIVALS else None
