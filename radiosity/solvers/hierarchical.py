@@ -94,6 +94,8 @@ COARSER = (16.0, 16.0, 4.0, 1.0)
 """Link errors of the rounds in units of the last: emitters first, then with what they lit, then finer."""
 EXACT_ELEMENTS, EXACT = 12, 1e-8
 """Up to this many elements, if no more may be made, form factors are found to this error: a second at most."""
+ELEMENTS_FALL = 0.8
+"""Power of the number of elements with which the link error falls (seen on rooms)."""
 FIRST_ERROR, LAST_ERROR = 1e-2, 1e-7
 """Link errors between which a wanted number of elements is sought."""
 BETWEEN_ROUNDS = 1e-3
@@ -993,8 +995,8 @@ def _next_error(solver: _Solver, state: _Round, link_error: float | None) -> flo
         assert solver.max_elements is not None
         share = solver.tree.leaf_count / solver.max_elements
         finer = share < 0.98 and state.error > LAST_ERROR
-        # Elements are about as many as the error is small: no smaller than they last, or links alone are refined.
-        error = max(0.5, 0.9 * share) * state.error if finer else state.error
+        # No smaller than the elements last, or links alone are refined.
+        error = max(0.5, share**ELEMENTS_FALL) * state.error if finer else state.error
     # Light that goes round more corners than there were rounds.
     return error if finer or solver.waiting() else None
 
