@@ -455,6 +455,29 @@ def _leaves(tree, found):
     return count
 
 
+@njit(nogil=True, cache=True)
+def _spreads(nodes, tree, spread):
+    """Mean square distance of the places of each of ``nodes`` from its centroid, by triangles."""
+    for i in range(nodes.shape[0]):
+        n = nodes[i]
+        total = area = 0.0
+        for p in range(tree.piece0[n], tree.piece1[n]):
+            a, b = tree.starts[p], tree.starts[p + 1]
+            for k in range(a + 1, b - 1):
+                square = 0.0
+                u, v = tree.corners[k] - tree.corners[a], tree.corners[k + 1] - tree.corners[a]
+                c = np.cross(u, v)
+                part = 0.5 * math.sqrt(c[0] * c[0] + c[1] * c[1] + c[2] * c[2])
+                # Over a triangle: the mean over the middles of its edges.
+                for axis in range(3):
+                    here = tree.corners[a, axis] - tree.centroid[n, axis]
+                    square += (here + 0.5 * u[axis]) ** 2 + (here + 0.5 * v[axis]) ** 2
+                    square += (here + 0.5 * (u[axis] + v[axis])) ** 2
+                total += part * square / 3.0
+                area += part
+        spread[i] = total / area if area > 0.0 else 0.0
+
+
 def _ranges(first: IntArray, last: IntArray) -> IntArray:
     """All integers of the ranges ``first[i]:last[i]``, one after another."""
     counts = last - first
@@ -779,6 +802,12 @@ class Hierarchy:
             edge = np.linalg.norm(tree.corners[first + after] - tree.corners[first + here], axis=1)
             longest[single] = edge if k == 0 else np.maximum(longest[single], edge)
         return longest
+
+    def spreads(self, nodes: IntArray) -> FloatArray:
+        """Mean square distance (n,) of the places of nodes from their centroids."""
+        spread = np.empty(len(nodes))
+        _spreads(nodes, self.arrays, spread)
+        return spread
 
     # ---- meshes --------------------------------------------------------------------------------
 

@@ -48,8 +48,12 @@ CUTS = 40
 """Longest candidate list that is cut."""
 SUMMED = 16
 """Pieces of a cluster that are seen one by one; with more, its samples stand for it."""
-UNEVEN = 15.0
+UNEVEN = 5.0
 """What an uneven sender counts against a receiver's own detail (measured on rooms)."""
+EDGE = 0.5
+"""Least share of how much a form factor varies by shadows that a slope leaves: an edge is none."""
+BENT = 0.5
+"""Least that a form factor is taken to bend over a node, in squares of how much it varies."""
 SHADOW_CORNERS = 12
 """Most corners of a quad's part in the shadow of a piece of the scene, with room to spare."""
 
@@ -89,11 +93,103 @@ def _view(x, y, z, nx, ny, nz, p0, p1, corners, starts, normals, slack):
 
 
 @njit(nogil=True, cache=True)
-def _views(points, count, own, node, tree, slack, values):
-    """Unoccluded form factor from each point of ``own`` to a node; the weighted mean, and how much it varies.
+def _fit(points, count, values, mean, normal, shape):
+    """Fit a plane to a function's ``values`` at points of a flat node; what it leaves.
 
-    The latter is the standard deviation, or what the middle of a single quad or triangle is off the mean:
-    by symmetry the points of a rule may agree where the middle does not.
+    ``shape`` (4,) gets its slope relative to ``mean``, and a bend of 0.  At least :data:`BENT` of the square of
+    what it varies, over its mean, is left: what falls as a power of the distance bends as much, and the points of
+    a rule do not see all ways to bend.
+    """
+    # Two axes of the plane.
+    thin = 0
+    for axis in range(1, 3):
+        if abs(normal[axis]) < abs(normal[thin]):
+            thin = axis
+    first, second = (thin + 1) % 3, (thin + 2) % 3
+    length = math.sqrt(normal[first] ** 2 + normal[second] ** 2)
+    e = np.zeros(3)
+    e[first], e[second] = -normal[second] / length, normal[first] / length
+    g = np.empty(3)
+    g[0] = normal[1] * e[2] - normal[2] * e[1]
+    g[1] = normal[2] * e[0] - normal[0] * e[2]
+    g[2] = normal[0] * e[1] - normal[1] * e[0]
+    weight = mu = mv = 0.0
+    for k in range(count):
+        w = points[k, 3]
+        weight += w
+        for axis in range(3):
+            mu += w * points[k, axis] * e[axis]
+            mv += w * points[k, axis] * g[axis]
+    mu, mv = mu / weight, mv / weight
+    uu = uv = vv = fu = fv = ff = 0.0
+    for k in range(count):
+        w, u, v = points[k, 3] / weight, -mu, -mv
+        for axis in range(3):
+            u += points[k, axis] * e[axis]
+            v += points[k, axis] * g[axis]
+        off = values[k] - mean
+        uu, uv, vv = uu + w * u * u, uv + w * u * v, vv + w * v * v
+        fu, fv, ff = fu + w * u * off, fv + w * v * off, ff + w * off * off
+    shape[:] = 0.0
+    det = uu * vv - uv * uv
+    if mean <= 0.0 or det <= 1e-9 * uu * vv:
+        return math.sqrt(ff)
+    su, sv = (fu * vv - fv * uv) / det, (fv * uu - fu * uv) / det
+    for axis in range(3):
+        shape[axis] = (su * e[axis] + sv * g[axis]) / mean
+    left = max(ff - su * fu - sv * fv, 0.0)
+    return min(max(math.sqrt(left), BENT * ff / mean), math.sqrt(ff))
+
+
+@njit(nogil=True, cache=True)
+def _flatten(shape, node, tree, breadth):
+    """Flatten a shape until it is nowhere negative over its node; by how much."""
+    least = 1.0 - max(shape[3], 0.0) * breadth
+    square = shape[0] * shape[0] + shape[1] * shape[1] + shape[2] * shape[2]
+    if square < (shape[3] * tree.size[node]) ** 2 and shape[3] > 0.0:
+        # The lowest place may lie inside.
+        least -= 0.25 * square / shape[3]
+    p = tree.piece0[node]
+    if tree.piece1[node] - p == 1:
+        # The lowest place of an edge is a corner, or, of what bends upward, where it is level.
+        last = tree.starts[p + 1] - 1
+        for i in range(tree.starts[p], tree.starts[p + 1]):
+            along = slope = length = 0.0
+            for axis in range(3):
+                side = tree.corners[i, axis] - tree.corners[last, axis]
+                away = tree.corners[last, axis] - tree.centroid[node, axis]
+                slope += side * shape[axis]
+                along += side * away
+                length += side * side
+            t = 0.0
+            if shape[3] > 0.0 and length > 0.0:
+                t = min(max(-(0.5 * slope / shape[3] + along) / length, 0.0), 1.0)
+            here = 1.0 - shape[3] * breadth
+            for axis in range(3):
+                away = tree.corners[last, axis] + t * (tree.corners[i, axis] - tree.corners[last, axis])
+                away -= tree.centroid[node, axis]
+                here += away * (shape[axis] + shape[3] * away)
+            least = min(least, here)
+            last = i
+    else:
+        reach = tree.size[node]
+        least = min(least, 1.0 - math.sqrt(square) * reach + min(shape[3], 0.0) * (reach * reach - breadth))
+    if least >= 0.0:
+        return 0.0
+    share = 1.0 / (1.0 - least)
+    for row in range(4):
+        shape[row] *= share
+    return 1.0 - share
+
+
+@njit(nogil=True, cache=True)
+def _views(points, count, own, node, tree, slack, values, shape):
+    """Unoccluded form factor from each point of ``own`` to a node: weighted mean, how much it varies, what is left.
+
+    It varies by the standard deviation, or by what the middle of a single quad or triangle is off the mean:
+    by symmetry the points of a rule may agree where the middle does not.  The ``shape`` (4,) is its relative
+    slope and bend; of the square of the distance from the middle, less its mean, for a bend of 1; the last figure
+    is what varies beside that.
     """
     p0, p1 = tree.piece0[node], tree.piece1[node]
     row = tree.sample[node]
@@ -116,13 +212,37 @@ def _views(points, count, own, node, tree, slack, values):
         weight += w
     mean = total / weight
     varies = math.sqrt(max(square / weight - mean * mean, 0.0))
+    bends = middle = 0.0
     if summed and tree.sample[own] < 0:
         middle = _view(
             tree.centroid[own, 0], tree.centroid[own, 1], tree.centroid[own, 2], tree.normal[own, 0],
             tree.normal[own, 1], tree.normal[own, 2], p0, p1, tree.corners, tree.starts, tree.piece_normal, slack,
         )  # fmt: skip
-        varies = max(varies, abs(middle - mean))
-    return mean, varies
+        bends = abs(middle - mean)
+    left = varies
+    if tree.flat[own] == 1:
+        left = _fit(points, count, values, mean, tree.normal[own], shape)
+        if bends > 0.0 and mean > 0.0:
+            shape[3] = (mean - middle) / (mean * _breadth(points, count))
+        left = max(left, BENT * bends)
+    else:
+        shape[:] = 0.0
+    return mean, max(varies, bends), left
+
+
+@njit(nogil=True, cache=True)
+def _breadth(points, count):
+    """Mean square distance of weighed points from their middle."""
+    weight = square = 0.0
+    c = np.zeros(3)
+    for k in range(count):
+        weight += points[k, 3]
+        for axis in range(3):
+            c[axis] += points[k, 3] * points[k, axis]
+    for k in range(count):
+        for axis in range(3):
+            square += points[k, 3] * (points[k, axis] - c[axis] / weight) ** 2
+    return square / weight
 
 
 @njit(nogil=True, cache=True)
@@ -260,7 +380,7 @@ NOT_SEEN = 2.0
 
 @njit(nogil=True, cache=True)
 def _share_at(points, count, x, y, tree, geo, found, many, limit, work, values, tally):
-    """Visible share of node ``y`` from points on ``x``: the share and the deviation of the form factor.
+    """Visible share of node ``y`` from points on ``x``: the share, the deviation and the mean of the form factor.
 
     The share is below zero if a point needs rays, and ``NOT_SEEN`` if no point sees the node at all.
     """
@@ -273,7 +393,7 @@ def _share_at(points, count, x, y, tree, geo, found, many, limit, work, values, 
             work.boxes, work.sizes, work.weights, work.cut, tally,
         )  # fmt: skip
         if value < 0.0:
-            return -1.0, 0.0
+            return -1.0, 0.0, 0.0
         values[k] = value
         w = points[k, 3]
         seen += w * value
@@ -282,7 +402,7 @@ def _share_at(points, count, x, y, tree, geo, found, many, limit, work, values, 
         weight += w
     mean = seen / weight
     deviation = math.sqrt(max(square / weight - mean * mean, 0.0))
-    return (seen / whole if whole > 0.0 else NOT_SEEN), deviation
+    return (seen / whole if whole > 0.0 else NOT_SEEN), deviation, mean
 
 
 @njit(nogil=True, cache=True)
@@ -374,9 +494,11 @@ def _hidden(x, y, tree, geo, found, many, rings, middle):
 @njit(nogil=True, cache=True)
 def measure(
     first, last, a, b, state, offset, count, pool, bright, tree, geo, limit, exchange, vary_a, vary_b,
-    doubt, new_count, new_pool, work, tally,
+    bend_a, bend_b, shape_a, shape_b, doubt, new_count, new_pool, work, tally,
 ):  # fmt: skip
     """Measure the pairs ``first..last``: exchange area, variation of F over each end, doubt of the exchange.
+
+    F varies over an end by ``vary``, of which the ``shape`` (4,), relative to F, leaves ``bend``.
 
     ``state``, ``offset``, ``count`` and the variations come from the pair that was split; the list of candidates is
     narrowed into ``new_pool``, of which the used length is returned, and ``new_count`` (-1: too many
@@ -385,6 +507,7 @@ def measure(
     planes = np.empty((40, 4))
     pa, pb = np.empty((NODE_SAMPLES, 7)), np.empty((NODE_SAMPLES, 7))
     va, vb = np.empty(NODE_SAMPLES), np.empty(NODE_SAMPLES)
+    sa, sb = np.empty(4), np.empty(4)
     cell = np.empty((4, 3))
     given = np.empty(MAX_CANDIDATES, dtype=np.int64)
     rings, middle = np.empty((4, SHADOW_CORNERS, 3)), np.empty(3)
@@ -393,12 +516,18 @@ def measure(
         x, y = a[i], b[i]
         new_count[i] = -1
         exchange[i] = doubt[i] = 0.0
+        shape_a[i, :] = 0.0
+        shape_b[i, :] = 0.0
         if x == y:
             # A cluster with itself: no more than a cap of a sphere whose normals spread as far.
             bound = 0.5 * (1.0 - math.cos(tree.cone[x]))
             exchange[i] = bound * tree.area[x]
-            vary_a[i] = vary_b[i] = bound
+            vary_a[i] = vary_b[i] = bend_a[i] = bend_b[i] = bound
             state[i] = RAYS
+            continue
+        if tree.area[x] <= 0.0 or tree.area[y] <= 0.0:
+            # A piece beside a seam or collinear corners, of no area.
+            state[i] = DROPPED
             continue
         flat_a, flat_b = tree.flat[x] == 1, tree.flat[y] == 1
         # A node's plane is exact: what only touches it exchanges nothing.
@@ -432,8 +561,8 @@ def measure(
         tally[CLOSED] += 1
         na = node_points(x, tree, cell, pa)
         nb = node_points(y, tree, cell, pb)
-        from_a, std_a = _views(pa, na, x, y, tree, geo.slack, va)
-        from_b, std_b = _views(pb, nb, y, x, tree, geo.slack, vb)
+        from_a, std_a, bent_a = _views(pa, na, x, y, tree, geo.slack, va, sa)
+        from_b, std_b, bent_b = _views(pb, nb, y, x, tree, geo.slack, vb, sb)
         one, two = from_a * tree.area[x], from_b * tree.area[y]
         off = abs(one - two)
         # The rule whose values agree better among themselves is the better one; what the two rules
@@ -459,14 +588,21 @@ def measure(
                         tree.starts[q], tree.starts[q + 1], tree.piece_normal[q], 1e-3 * off + 1e-15 * tree.area[x],
                         work.pair,
                     )  # fmt: skip
-            std_a = max(std_a, value / tree.area[x])
-            std_b = max(std_b, value / tree.area[y])
+            std_a, bent_a = max(std_a, value / tree.area[x]), max(bent_a, value / tree.area[x])
+            std_b, bent_b = max(std_b, value / tree.area[y]), max(bent_b, value / tree.area[y])
             off_a = off_b = doubt[i] = 0.0
         exchange[i] = value
         open_a, open_b = value / tree.area[x], value / tree.area[y]
         open_vary_a, open_vary_b = max(std_a, 0.5 * off_a / tree.area[x]), max(std_b, 0.5 * off_b / tree.area[y])
+        open_bend_a, open_bend_b = max(bent_a, 0.5 * off_a / tree.area[x]), max(bent_b, 0.5 * off_b / tree.area[y])
+        wide_a, wide_b = _breadth(pa, na), _breadth(pb, nb)
+        open_bend_a = max(open_bend_a, _flatten(sa, x, tree, wide_a) * open_vary_a)
+        open_bend_b = max(open_bend_b, _flatten(sb, y, tree, wide_b) * open_vary_b)
+        vary_a[i], vary_b[i] = open_vary_a, open_vary_b
+        bend_a[i], bend_b[i] = open_bend_a, open_bend_b
+        for row in range(4):
+            shape_a[i, row], shape_b[i, row] = sa[row], sb[row]
         if not both:
-            vary_a[i], vary_b[i] = open_vary_a, open_vary_b
             gap = _gap(x, y, tree)
             extent = max(0.0 if flat_a else tree.size[x], 0.0 if flat_b else tree.size[y])
             if gap < 0.5 * extent:
@@ -474,6 +610,9 @@ def measure(
                 high = math.pi * gap * gap
                 vary_a[i] = 0.5 if high <= tree.area[y] else 0.5 * tree.area[y] / high
                 vary_b[i] = 0.5 if high <= tree.area[x] else 0.5 * tree.area[x] / high
+                bend_a[i], bend_b[i] = vary_a[i], vary_b[i]
+                shape_a[i, :] = 0.0
+                shape_b[i, :] = 0.0
                 state[i] = NEAR
             elif value == 0.0:
                 state[i] = DROPPED
@@ -487,7 +626,6 @@ def measure(
             continue
         if many == 0:
             state[i] = CLEAR
-            vary_a[i], vary_b[i] = open_vary_a, open_vary_b
             new_count[i] = 0
             tally[TALLY_CLEAR] += 1
             continue
@@ -498,14 +636,14 @@ def measure(
             new_count[i] = many
         if 0 < many <= CUTS:
             at_a = _receives_at_a(x, y, tree.area, bright)
-            share = NOT_SEEN
+            share, seen = NOT_SEEN, 0.0
             for _ in range(2):
                 if at_a:
-                    share, deviation = _share_at(
+                    share, deviation, seen = _share_at(
                         pa, na, x, y, tree, geo, work.found, many, limit, work, va, tally
                     )  # fmt: skip
                 else:
-                    share, deviation = _share_at(
+                    share, deviation, seen = _share_at(
                         pb, nb, y, x, tree, geo, work.found, many, limit, work, vb, tally
                     )  # fmt: skip
                 if share != NOT_SEEN:
@@ -531,13 +669,26 @@ def measure(
                 # The other end's visibility is taken to vary as much, relative to its form factor.
                 spread = max(other * deviation / own, other * (hidden_b if at_a else hidden_a))
                 if at_a:
-                    vary_a[i] = deviation
-                    vary_b[i] = max(open_vary_b * share, spread)
+                    bent = own * share
+                    if seen > 0.0:
+                        bend = sa[3]
+                        bent = _fit(pa, na, va, seen, tree.normal[x], sa)
+                        sa[3] = bend
+                    vary_a[i], bend_a[i] = deviation, max(bent, EDGE * deviation)
+                    vary_b[i], bend_b[i] = max(open_vary_b * share, spread), max(open_bend_b * share, spread)
                 else:
-                    vary_b[i] = deviation
-                    vary_a[i] = max(open_vary_a * share, spread)
+                    bent = own * share
+                    if seen > 0.0:
+                        bend = sb[3]
+                        bent = _fit(pb, nb, vb, seen, tree.normal[y], sb)
+                        sb[3] = bend
+                    vary_b[i], bend_b[i] = deviation, max(bent, EDGE * deviation)
+                    vary_a[i], bend_a[i] = max(open_vary_a * share, spread), max(open_bend_a * share, spread)
+                bend_a[i] = max(bend_a[i], _flatten(sa, x, tree, wide_a) * vary_a[i])
+                bend_b[i] = max(bend_b[i], _flatten(sb, y, tree, wide_b) * vary_b[i])
+                for row in range(4):
+                    shape_a[i, row], shape_b[i, row] = sa[row], sb[row]
                 continue
-        vary_a[i], vary_b[i] = open_vary_a, open_vary_b
         state[i] = RAYS
         tally[COMPLEX] += 1
     return position
@@ -597,7 +748,9 @@ def pair_rays(
 
 
 @njit(nogil=True, cache=True)
-def apply_rays(pairs, counts, a, b, whole, starts, weights, blocked, area, exchange, vary_a, vary_b, doubt):
+def apply_rays(
+    pairs, counts, a, b, whole, starts, weights, blocked, area, exchange, vary_a, vary_b, bend_a, bend_b, doubt
+):
     """Scale the unoccluded exchange areas ``whole`` of pairs by what their rays saw."""
     for i in range(pairs.shape[0]):
         k = pairs[i]
@@ -626,8 +779,10 @@ def apply_rays(pairs, counts, a, b, whole, starts, weights, blocked, area, excha
         exchange[k] = value * share
         doubt[k] = value * math.sqrt(safe * (1.0 - safe) / (effective + 2.0))
         partly = math.sqrt(share * (1.0 - share))
-        vary_a[k] = max(vary_a[k] * max(share, 1.0 / effective), 0.5 * value / area[x] * partly)
-        vary_b[k] = max(vary_b[k] * max(share, 1.0 / effective), 0.5 * value / area[y] * partly)
+        seen = max(share, 1.0 / effective)
+        one, two = 0.5 * value / area[x] * partly, 0.5 * value / area[y] * partly
+        vary_a[k], bend_a[k] = max(vary_a[k] * seen, one), max(bend_a[k] * seen, one)
+        vary_b[k], bend_b[k] = max(vary_b[k] * seen, two), max(bend_b[k] * seen, two)
 
 
 @njit(nogil=True, cache=True)
@@ -644,7 +799,10 @@ def _contrast(sender, receiver, bright, uneven, received):
 
 
 @njit(nogil=True, cache=True)
-def link_errors(a, b, vary_a, vary_b, doubt, area, bright, uneven, received, node_area, over, under, unsure, linear):
+def link_errors(
+    a, b, vary_a, vary_b, bend_a, bend_b, doubt, area, shaped, bright, uneven, received, node_area, over, under, unsure,
+    linear,
+):  # fmt: skip
     """Errors of all links by receiving node: sums of squares (``linear`` 0) or of magnitudes (1).
 
     ``over`` and ``under`` are those over receivers and over senders, see :func:`judge`; ``unsure`` those of the
@@ -654,11 +812,15 @@ def link_errors(a, b, vary_a, vary_b, doubt, area, bright, uneven, received, nod
         x, y = a[i], b[i]
         if node_area[x] <= 0.0 or node_area[y] <= 0.0:
             continue
-        for _ in range(2):
+        for end in range(2):
             one = _contrast(y, x, bright, uneven, received)
-            own, far = one * vary_a[i], uneven[y] * vary_b[i] * area[y] / area[x]
-            if y != b[i]:
-                own, far = one * vary_b[i], uneven[y] * vary_a[i] * area[y] / area[x]
+            if end == 0:
+                own = bend_a[i] if shaped[x] else vary_a[i]
+                far = bend_b[i]
+            else:
+                own = bend_b[i] if shaped[x] else vary_b[i]
+                far = bend_a[i]
+            own, far = one * own, uneven[y] * far * area[y] / area[x]
             off = one * doubt[i] / area[x]
             over[x] += own if linear else own * own
             under[x] += far if linear else far * far
@@ -670,16 +832,16 @@ def link_errors(a, b, vary_a, vary_b, doubt, area, bright, uneven, received, nod
 
 @njit(nogil=True, cache=True)
 def judge(
-    a, b, vary_a, vary_b, state, area, flat, size, bright, uneven, received, detail, bias, weight, share, can_split,
-    error, verdict, need,
+    a, b, vary_a, vary_b, bend_a, bend_b, state, area, flat, size, shaped, bright, uneven, received, detail, bias,
+    weight, share, can_split, error, verdict, need,
 ):  # fmt: skip
     """What to do with each pair: 0 keep, 1 split the first end, 2 the second.
 
     An end that receives has two errors: the form factor varies over it (``detail``: splitting it resolves
-    that), and radiosity and form factor both vary over the end that sends (``bias``: splitting the
-    sender does).  Errors of the links to one receiver add up, so with the sums T of all of them the
-    mean square error over all surfaces is the sum over links of ``error * T * A / total``, and the
-    root of each link's term is what is held below ``error``.
+    that; over what is ``shaped`` only what the shape leaves counts), and radiosity and form factor both
+    bend over the end that sends (``bias``: splitting the sender resolves that).  Errors of the links to one receiver
+    add up, so with the sums T of all of them the mean square error over all surfaces is the sum over links of
+    ``error * T * A / total``, and the root of each link's term is what is held below ``error``.
     ``share`` holds ``sqrt(A / total)``, ``weight`` that times what a receiver's own detail matters;
     ``bright`` and ``uneven`` the mean and the deviation of each node's radiosity, and ``received`` its irradiance
     where rows are balanced, in units of the mean irradiance.  What is uneven counts :data:`UNEVEN` times: it is of
@@ -691,10 +853,10 @@ def judge(
         if state[i] <= 0:
             continue
         x, y = a[i], b[i]
-        own_a = _contrast(y, x, bright, uneven, received) * vary_a[i]
-        own_b = _contrast(x, y, bright, uneven, received) * vary_b[i]
-        far_a = UNEVEN * uneven[y] * vary_b[i] * area[y] / area[x]
-        far_b = UNEVEN * uneven[x] * vary_a[i] * area[x] / area[y]
+        own_a = _contrast(y, x, bright, uneven, received) * (bend_a[i] if shaped[x] else vary_a[i])
+        own_b = _contrast(x, y, bright, uneven, received) * (bend_b[i] if shaped[y] else vary_b[i])
+        far_a = UNEVEN * uneven[y] * bend_b[i] * area[y] / area[x]
+        far_b = UNEVEN * uneven[x] * bend_a[i] * area[x] / area[y]
         need_a = max(
             math.sqrt(own_a * max(own_a, detail[x])) * weight[x], math.sqrt(far_b * max(far_b, bias[y])) * share[y]
         )  # fmt: skip

@@ -68,11 +68,80 @@ def push(values, count, opened, child, children):
 
 
 @njit(nogil=True, cache=True)
-def sort_links(a, b, exchange, area, start, column, factor):
+def spreads(spread, count, opened, child, children, area, centre):
+    """Mean square distances from the centre, of leaves (nodes,), for every node above them, in place."""
+    for n in range(count - 1, -1, -1):
+        if opened[n] == 0:
+            continue
+        spread[n] = 0.0
+        if area[n] <= 0.0:
+            continue
+        for k in range(child[n], child[n] + children[n]):
+            square = spread[k]
+            for axis in range(3):
+                square += (centre[k, axis] - centre[n, axis]) ** 2
+            spread[n] += area[k] / area[n] * square
+
+
+@njit(nogil=True, cache=True)
+def pull_moments(values, count, opened, child, children, area, centre, spread):
+    """Means and moments of the leaves, for every node above them, in place; (nodes, 5, bands).
+
+    With u the place from the centre, the rows hold the means of the value times 1, u (three rows), and
+    u . u - ``spread``; all but the first are 0 over a leaf, which is even.
+    """
+    bands = values.shape[2]
+    for n in range(count - 1, -1, -1):
+        values[n, 1:, :] = 0.0
+        if opened[n] == 0:
+            continue
+        values[n, 0, :] = 0.0
+        if area[n] <= 0.0:
+            continue
+        for k in range(child[n], child[n] + children[n]):
+            share = area[k] / area[n]
+            x, y, z = centre[k, 0] - centre[n, 0], centre[k, 1] - centre[n, 1], centre[k, 2] - centre[n, 2]
+            square = x * x + y * y + z * z + spread[k] - spread[n]
+            for band in range(bands):
+                here = values[k, 0, band]
+                one, two, three = values[k, 1, band], values[k, 2, band], values[k, 3, band]
+                values[n, 0, band] += share * here
+                values[n, 1, band] += share * (one + x * here)
+                values[n, 2, band] += share * (two + y * here)
+                values[n, 3, band] += share * (three + z * here)
+                values[n, 4, band] += share * (
+                    values[k, 4, band] + 2.0 * (x * one + y * two + z * three) + square * here
+                )
+
+
+@njit(nogil=True, cache=True)
+def push_shapes(values, count, opened, child, children, centre, spread):
+    """Add what each opened node received, by its :func:`pull_moments` shapes, to its parts, in place.
+
+    ``values`` (nodes, 5, bands); leaves end with the whole.
+    """
+    bands = values.shape[2]
+    for n in range(count):
+        if opened[n] == 0:
+            continue
+        for k in range(child[n], child[n] + children[n]):
+            x, y, z = centre[k, 0] - centre[n, 0], centre[k, 1] - centre[n, 1], centre[k, 2] - centre[n, 2]
+            square = x * x + y * y + z * z + spread[k] - spread[n]
+            for band in range(bands):
+                one, two, three, bend = values[n, 1, band], values[n, 2, band], values[n, 3, band], values[n, 4, band]
+                values[k, 0, band] += values[n, 0, band] + x * one + y * two + z * three + square * bend
+                values[k, 1, band] += one + 2.0 * x * bend
+                values[k, 2, band] += two + 2.0 * y * bend
+                values[k, 3, band] += three + 2.0 * z * bend
+                values[k, 4, band] += bend
+
+
+@njit(nogil=True, cache=True)
+def sort_links(a, b, shape_a, shape_b, start, column, place, own, far):
     """Both directions of every link, gathered by receiver: row ``n`` is ``start[n]:start[n + 1]``.
 
-    ``factor`` holds the form factor from the receiver to the sender ``column``, 0 from one without area.  A link
-    of a node with itself stands once.
+    ``column`` is the sender, ``place`` the link, ``own`` and ``far`` the shapes of the form factor over
+    receiver and sender.  A link of a node with itself stands once.
     """
     rows = start.shape[0] - 1
     start[:] = 0
@@ -82,30 +151,60 @@ def sort_links(a, b, exchange, area, start, column, factor):
             start[b[i] + 1] += 1
     for n in range(rows):
         start[n + 1] += start[n]
-    place = start[:-1].copy()
+    free = start[:-1].copy()
     for i in range(a.shape[0]):
         x, y = a[i], b[i]
-        column[place[x]] = y
-        factor[place[x]] = exchange[i] / area[x] if area[x] > 0.0 else 0.0
-        place[x] += 1
+        e = free[x]
+        column[e], place[e] = y, i
+        for row in range(4):
+            own[e, row], far[e, row] = shape_a[i, row], shape_b[i, row]
+        free[x] += 1
         if x != y:
-            column[place[y]] = x
-            factor[place[y]] = exchange[i] / area[y] if area[y] > 0.0 else 0.0
-            place[y] += 1
+            e = free[y]
+            column[e], place[e] = x, i
+            for row in range(4):
+                own[e, row], far[e, row] = shape_b[i, row], shape_a[i, row]
+            free[y] += 1
 
 
 @njit(nogil=True, cache=True)
-def gather(first, last, start, column, factor, values, out):
-    """Irradiance that rows ``first..last`` receive over their own links from ``values`` (nodes, bands)."""
-    bands = values.shape[1]
+def form_factors(exchange, area, start, place, factor):
+    """Form factors from the receivers of sorted links, from exchange areas of links; 0 from one without area."""
+    for n in range(start.shape[0] - 1):
+        for e in range(start[n], start[n + 1]):
+            factor[e] = exchange[place[e]] / area[n] if area[n] > 0.0 else 0.0
+
+
+@njit(nogil=True, cache=True)
+def gather(first, last, start, column, factor, own, far, shaped, values, leaves_too, out):
+    """Irradiance that rows ``first..last`` receive over their own links, and its shape over each.
+
+    ``values`` and ``out`` (nodes, 5, bands) are as in :func:`pull_moments` and :func:`push_shapes`.
+    Only what is ``shaped`` sends and gets shapes (with ``leaves_too`` every receiver gets them).
+    """
+    bands = values.shape[2]
     for n in range(first, last):
-        for band in range(bands):
-            out[n, band] = 0.0
-        for i in range(start[n], start[n + 1]):
-            j = column[i]
-            f = factor[i]
+        out[n, :, :] = 0.0
+        both = leaves_too or shaped[n]
+        for e in range(start[n], start[n + 1]):
+            j = column[e]
+            f = factor[e]
+            moments = shaped[j]
+            # Written out: loops over four rows cost more than the work in them.
             for band in range(bands):
-                out[n, band] += f * values[j, band]
+                sent = values[j, 0, band]
+                if moments:
+                    sent += (
+                        far[e, 0] * values[j, 1, band] + far[e, 1] * values[j, 2, band]
+                        + far[e, 2] * values[j, 3, band] + far[e, 3] * values[j, 4, band]
+                    )  # fmt: skip
+                sent *= f
+                out[n, 0, band] += sent
+                if both:
+                    out[n, 1, band] += own[e, 0] * sent
+                    out[n, 2, band] += own[e, 1] * sent
+                    out[n, 3, band] += own[e, 2] * sent
+                    out[n, 4, band] += own[e, 3] * sent
 
 
 @njit(nogil=True, cache=True)

@@ -11,9 +11,12 @@ from them:
   clear, and a part of any other chooses its candidates among the whole's;
 * a link keeps the exchange area of both directions, so reciprocity is exact; in a scene declared
   closed the rows are balanced to sum to 1 without breaking it;
+* over each end of a link the form factor has a slope and a bend, as in Galerkin radiosity (H. Zatz, SIGGRAPH 1993),
+  whose moments are pulled and pushed with the means: the product of two means misses light where both are large,
+  which made rooms half a per cent too dark;
 * light is exchanged by the bare parts of what is covered, and row sums above 1 are levelled with their
   neighbours' in open scenes: cutting them alone would lose light;
-* a pair whose sender is uneven is split sooner: the product of two means misses what is bright where it is near;
+* a pair whose sender is uneven is split sooner, for what its shapes miss;
 * what a link may be off is weighed by its receiver's share of all area, so that the sum of squares
   over all links estimates the mean square error: shadow edges end by themselves;
 * the equations are solved by conjugate gradients over push and pull, which near reflectance 1 needs
@@ -51,7 +54,20 @@ from radiosity.solvers._pairs import (
     pair_rays,
     tolerances,
 )
-from radiosity.solvers._push_pull import deviations, expand, gather, level, pull, push, sort_links, total
+from radiosity.solvers._push_pull import (
+    deviations,
+    expand,
+    form_factors,
+    gather,
+    level,
+    pull,
+    pull_moments,
+    push,
+    push_shapes,
+    sort_links,
+    spreads,
+    total,
+)
 from radiosity.solvers.incident import cosine_directions, incident_irradiance, incident_spread, points_of_elements
 from radiosity.solvers.progressive import CHECKPOINT_SECONDS, CHECKPOINT_SHARE, remaining_bound
 from radiosity.solvers.solution import Checkpoint, EnergyBook, Progress, ProgressEvent, Solution
@@ -98,19 +114,19 @@ ELEMENTS_FALL = 0.8
 """Power of the number of elements with which the link error falls (seen on rooms)."""
 FIRST_ERROR, LAST_ERROR = 1e-2, 1e-7
 """Link errors between which a wanted number of elements is sought."""
-BETWEEN_ROUNDS = 1e-3
-"""What row sums may be off while links are still refined."""
-LEAST_LOOSE, LOOSE_ROUNDS = 0.02, 20
+BETWEEN_ROUNDS, ROWS_OFF = 1e-3, 1e-11
+"""What balanced row sums may be off while links are still refined, and at the end."""
+LEAST_LOOSE, LOOSE_ROUNDS = 0.02, 10
 """Least share of a link that row balancing may scale, and rounds before everything is scaled."""
 COVER_POINTS, COVER_RAYS = (8, 16), (1, 6)
 """Points of an element, and rays from each, that tell how much of it is covered: of all, and of doubtful ones."""
-PAIR_BYTES = 120
+PAIR_BYTES = 220
 """Memory that a new pair takes while it is measured, and as a link with both its directions."""
 SMALLEST = 2.0**-14
 """Shortest edge that is split by default, as a share of the scene's size."""
 
 
-_NODE_VALUES = ("bright", "received", "uneven", "detail", "bias")
+_NODE_VALUES = ("bright", "received", "uneven", "detail", "bias", "whole")
 """Arrays (nodes,) that one round leaves for the next."""
 
 
@@ -126,7 +142,11 @@ class _Links:
     exchange: FloatArray
     vary_a: NDArray[np.float32]
     vary_b: NDArray[np.float32]
+    bend_a: NDArray[np.float32]
+    bend_b: NDArray[np.float32]
     doubt: NDArray[np.float32]
+    shape_a: NDArray[np.float32]
+    shape_b: NDArray[np.float32]
 
     @classmethod
     def unseen(cls, a: NDArray, b: NDArray) -> _Links:
@@ -138,7 +158,8 @@ class _Links:
             np.zeros(n, dtype=np.int64),
             np.full(n, -1, dtype=np.int32),
             np.zeros(n),
-            *(np.zeros(n, dtype=np.float32) for _ in range(3)),
+            *(np.zeros(n, dtype=np.float32) for _ in range(5)),
+            *(np.zeros((n, 4), dtype=np.float32) for _ in range(2)),
         )
 
     def __len__(self) -> int:
@@ -180,6 +201,8 @@ class _Exchange:
         self.node_area = np.zeros(tree.node_count)
         self.node_area[leaves] = self.area
         total(self.node_area, tree.node_count, tree.arrays.opened, tree.arrays.child, tree.arrays.children)
+        self.whole = self.node_area >= (1.0 - 1e-9) * tree.arrays.area[: tree.node_count]
+        """Nodes without a covered part: shapes are about their middles."""
         self.scale = np.ones(len(self.leaves))
         self.loose_scale = np.ones(len(self.leaves))
         self.wanted: FloatArray | None = None
@@ -188,13 +211,23 @@ class _Exchange:
         self.links = links
         self.exchange = links.exchange if with_unseen else np.where(links.state > 0, links.exchange, 0.0)
         self.start = np.zeros(tree.node_count + 1, dtype=np.int64)
-        self.column = np.zeros(2 * len(links), dtype=np.int32)
+        directions = 2 * len(links) - int((links.a == links.b).sum())
+        self.column, self.place = (np.empty(directions, dtype=np.int32) for _ in range(2))
+        self.own, self.far = (np.empty((directions, 4), dtype=np.float32) for _ in range(2))
+        sort_links(
+            links.a, links.b, links.shape_a, links.shape_b, self.start, self.column, self.place, self.own, self.far
+        )
+        n, arrays = tree.node_count, tree.arrays
+        self.shaped = self.whole & (arrays.opened[:n] == 1)
+        self.spread = np.zeros(n)
+        self.spread[leaves] = tree.spreads(leaves)
+        spreads(self.spread, n, arrays.opened, arrays.child, arrays.children, arrays.area, arrays.centroid)
         self.firm = self._sorted(self.exchange)
         self.loose: FloatArray | None = None
 
     def _sorted(self, exchange: FloatArray) -> FloatArray:
-        links, factor = self.links, np.zeros(len(self.column))
-        sort_links(links.a, links.b, exchange, self.node_area, self.start, self.column, factor)
+        factor = np.empty(len(self.column))
+        form_factors(exchange, self.node_area, self.start, self.place, factor)
         return factor
 
     def up(self, values: FloatArray) -> FloatArray:
@@ -211,16 +244,27 @@ class _Exchange:
         push(nodes, self.tree.node_count, arrays.opened, arrays.child, arrays.children)
         return nodes[self.leaves]
 
-    def _cross(self, factor: FloatArray, values: FloatArray) -> FloatArray:
-        """What ``values`` (n, bands) of the leaves bring to the leaves over links of these form factors."""
-        nodes = self.up(values)
+    def _cross(self, factor: FloatArray, values: FloatArray, *, shapes: bool = False) -> FloatArray:
+        """What ``values`` (n, bands) of the leaves bring to the leaves over links of these form factors.
+
+        With ``shapes`` also how it falls over each leaf: (n, 5, bands), see :func:`push_shapes`.
+        """
+        arrays = self.tree.arrays
+        tree = self.tree.node_count, arrays.opened, arrays.child, arrays.children
+        nodes = np.zeros((self.tree.node_count, 5, values.shape[1]))
+        nodes[self.leaves, 0] = values
+        pull_moments(nodes, *tree, self.node_area, arrays.centroid, self.spread)
         received = np.empty_like(nodes)
 
         def rows(first: int) -> None:
-            gather(first, min(first + ROWS, len(nodes)), self.start, self.column, factor, nodes, received)
+            gather(
+                first, min(first + ROWS, len(nodes)), self.start, self.column, factor, self.own, self.far,
+                self.shaped, nodes, shapes, received,
+            )  # fmt: skip
 
         list(self.pool.map(rows, range(0, len(nodes), ROWS)))
-        return self.down(received)
+        push_shapes(received, *tree, arrays.centroid, self.spread)
+        return received[self.leaves] if shapes else received[self.leaves, 0]
 
     def __call__(self, values: FloatArray) -> FloatArray:
         scaled = values * self.scale[:, None]
@@ -237,7 +281,7 @@ class _Exchange:
         everything where that does not do.
         """
         links, area = self.links, self.tree.arrays.area
-        off = np.maximum(np.maximum(links.vary_a * area[links.a], links.vary_b * area[links.b]), links.doubt)
+        off = np.maximum(np.maximum(links.bend_a * area[links.a], links.bend_b * area[links.b]), links.doubt)
         share = np.divide(off, self.exchange, out=np.ones_like(self.exchange), where=self.exchange > 0)
         share = np.clip(share, LEAST_LOOSE, 1.0)
         self.loose = self._sorted(self.exchange * share)
@@ -311,6 +355,7 @@ class _Solver:
         self.uneven = np.zeros(n)
         self.detail = np.zeros(n)
         self.bias = np.zeros(n)
+        self.whole = np.ones(n, dtype=bool)
         self._weigh()
 
     def close(self) -> None:
@@ -394,6 +439,7 @@ class _Solver:
             reflected = np.where(surface >= 0, self.rho.max(axis=1)[np.maximum(surface, 0)], self.rho.max())
             # Detail between elements is light put in the wrong place; within one it is only not shown.
             self.weight = share * reflected * np.where(arrays.opened[:n] == 1, BETWEEN, GATHERED)
+        self.shaped = self.whole & (arrays.opened[:n] == 1)
         self.can_split = (arrays.opened[:n] == 1) | (arrays.children[:n] > 0) | (arrays.size[:n] > 2.0 * self.min_edge)
 
     def _grown(self) -> None:
@@ -409,6 +455,7 @@ class _Solver:
             self.uneven = np.concatenate([self.uneven, np.zeros(n - old)])
             self.detail = np.concatenate([self.detail, self.detail[parent]])
             self.bias = np.concatenate([self.bias, self.bias[parent]])
+            self.whole = np.concatenate([self.whole, self.whole[parent]])
         self._weigh()
 
     # ---- frontiers -----------------------------------------------------------------------------
@@ -438,7 +485,7 @@ class _Solver:
             used = measure(
                 first, last, pairs.a, pairs.b, pairs.state, pairs.offset, pairs.count, self.candidates, self.bright,
                 self.tree.arrays, self.geo, CUT_LIMIT, pairs.exchange, pairs.vary_a, pairs.vary_b,
-                pairs.doubt, counts, fresh, scratch, tally,
+                pairs.bend_a, pairs.bend_b, pairs.shape_a, pairs.shape_b, pairs.doubt, counts, fresh, scratch, tally,
             )  # fmt: skip
             narrowed[first] = fresh[:used].copy()
 
@@ -473,7 +520,7 @@ class _Solver:
             self.seconds_in_embree += time.perf_counter() - clock
             apply_rays(
                 block, many, pairs.a, pairs.b, whole[block], starts, weights, blocked, self.tree.arrays.area,
-                pairs.exchange, pairs.vary_a, pairs.vary_b, pairs.doubt,
+                pairs.exchange, pairs.vary_a, pairs.vary_b, pairs.bend_a, pairs.bend_b, pairs.doubt,
             )  # fmt: skip
             traced.append(used)
 
@@ -484,9 +531,10 @@ class _Solver:
     def _judge(self, pairs: _Links, error: float) -> tuple[NDArray[np.int8], FloatArray]:
         verdict, need = np.empty(len(pairs), dtype=np.int8), np.empty(len(pairs))
         judge(
-            pairs.a, pairs.b, pairs.vary_a, pairs.vary_b, pairs.state, self.tree.arrays.area, self.tree.arrays.flat,
-            self.tree.arrays.size, self.bright, self.uneven, self.received, self.detail, self.bias, self.weight,
-            self.plain, self.can_split, error, verdict, need,
+            pairs.a, pairs.b, pairs.vary_a, pairs.vary_b, pairs.bend_a, pairs.bend_b, pairs.state,
+            self.tree.arrays.area, self.tree.arrays.flat, self.tree.arrays.size, self.shaped, self.bright,
+            self.uneven, self.received, self.detail, self.bias, self.weight, self.plain, self.can_split, error,
+            verdict, need,
         )  # fmt: skip
         return verdict, need
 
@@ -562,7 +610,8 @@ class _Solver:
         # Of a clear pair all parts are clear; of any other they choose among its candidates.
         known = pairs.state[came]
         made.state[known == CLEAR], made.state[known == CUT] = PART_OF_CLEAR, PART_OF_CUT
-        made.vary_a[:], made.vary_b[:] = pairs.vary_a[came], pairs.vary_b[came]
+        for name in ("vary_a", "vary_b", "bend_a", "bend_b"):
+            getattr(made, name)[:] = getattr(pairs, name)[came]
         made.offset[:], made.count[:] = pairs.offset[came], pairs.count[came]
         # Until it is measured a part has its share of the whole.
         split = np.where(verdict[came] == 1, pairs.a[came], pairs.b[came])
@@ -732,8 +781,9 @@ class _Solver:
         self.bright = mean.max(axis=1)
         self.uneven = np.empty(len(mean))
         deviations(square, mean, self.uneven)
-        whole = exchange.up(exchange.balanced[:, None].astype(np.float64))[:, 0] > 1.0 - 1e-9
-        self.received = np.where(whole, exchange.up(irradiance / unit).max(axis=1), 0.0)
+        self.whole = exchange.whole
+        closed = exchange.up(exchange.balanced[:, None].astype(np.float64))[:, 0] > 1.0 - 1e-9
+        self.received = np.where(closed, exchange.up(irradiance / unit).max(axis=1), 0.0)
         self._weigh()
 
     def accumulate(self, exchange: _Exchange) -> None:
@@ -759,8 +809,9 @@ class _Solver:
         links, arrays = self.links, self.tree.arrays
         nodes = np.zeros((3, self.tree.node_count))
         link_errors(
-            links.a, links.b, links.vary_a, links.vary_b, links.doubt, arrays.area, self.bright, self.uneven,
-            self.received, exchange.node_area, nodes[0], nodes[1], nodes[2], linear,
+            links.a, links.b, links.vary_a, links.vary_b, links.bend_a, links.bend_b, links.doubt, arrays.area,
+            exchange.shaped, self.bright, self.uneven, self.received, exchange.node_area, nodes[0], nodes[1], nodes[2],
+            linear,
         )  # fmt: skip
         return list(exchange.down(nodes.T.copy()).T)
 
@@ -853,7 +904,7 @@ def _solve_links(solver: _Solver, exchange: _Exchange, solution: Solution, *, li
     solution.element_irradiance = incident + arriving
     solution.radiosity = mesh.emission + mesh.reflectance * solution.element_irradiance
     # What was sent of what leaves: the rest, a residual, is yet unshot.
-    bare = (area / mesh.element_area)[:, None]
+    bare = np.divide(area, mesh.element_area, out=np.zeros_like(area), where=mesh.element_area > 0)[:, None]
     solution.unshot = bare * (solution.radiosity - seen)
     covered = (mesh.element_area - area) @ mesh.emission
     book.emitted = covered + area @ (mesh.emission + incident)
@@ -1058,7 +1109,7 @@ def _rounds(
             pause = max(CHECKPOINT_SECONDS, (saved - start) / CHECKPOINT_SHARE)
     assert solution is not None
     with record.stage("solve"):
-        exchange.settle(1e-13)
+        exchange.settle(ROWS_OFF)
         limit = 1e-3
         while True:
             limit *= 1e-3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -388,6 +389,78 @@ def test_the_conforming_export_has_no_t_junctions():
     value = poly.point_data["radiosity_W_m2"]
     for group in np.unique(place[on_floor]):
         assert np.ptp(value[on_floor & (place == group)]) < 1e-9
+
+
+def exchanged(scene, monkeypatch, **options):
+    """A solution and the operator that it was found with."""
+    kept = []
+    stated = hierarchical._Solver.stated_errors
+    monkeypatch.setattr(
+        hierarchical._Solver, "stated_errors", lambda self, exchange: kept.append(exchange) or stated(self, exchange)
+    )
+    solution = solve(scene, **options)
+    exchange = kept[-1]
+    exchange.pool = ThreadPoolExecutor(1)
+    return solution, exchange
+
+
+def test_light_that_falls_over_both_ends_of_links_keeps_reciprocity_and_no_part_is_negative(monkeypatch):
+    solution, exchange = exchanged(room_with_ball(), monkeypatch, link_error=5e-3)
+    assert (exchange.shaped[exchange.links.a] & (np.abs(exchange.links.shape_a).max(axis=1) > 0)).any()
+    rng = np.random.default_rng(2)
+    one, two = rng.random((2, solution.mesh.element_count, 2)) ** 8
+    there, back = exchange.area @ (one * exchange(two)), exchange.area @ (two * exchange(one))
+    assert there == pytest.approx(back, rel=1e-12)
+    # Single bright elements send nobody less than nothing.
+    dots = np.eye(solution.mesh.element_count)[:, :: max(1, solution.mesh.element_count // 60)]
+    assert exchange(dots).min() > -1e-12 * exchange(dots).max()
+
+
+def test_coarse_links_shift_the_mean_by_no_more_than_a_few_thousandths(monkeypatch):
+    # One mesh, links of very different numbers: means of products for products of means made it 0.7 % darker.
+    scene, geometry = (lambda s: (s, Geometry.from_scene(s)))(workbench.load("cornell-box"))
+    found = []
+    for error in (1e-2, 3e-4):
+        record = RunRecord(command="solve")
+        solution = hierarchical.solve_hierarchical(
+            scene, geometry, record, max_edge=0.11, min_edge=0.066, link_error=error
+        )
+        found.append((record.results["links"], solution))
+    (few, coarse), (many, fine) = found
+    assert coarse.mesh.element_count == fine.mesh.element_count
+    assert few < 1.2 * fine.mesh.element_count and many > 20 * few
+    assert coarse.mean_irradiance.mean() == pytest.approx(fine.mean_irradiance.mean(), rel=2.5e-3)
+    off = (coarse.element_irradiance - fine.element_irradiance).mean(axis=1)
+    area = fine.mesh.element_area
+    assert math.sqrt(area @ off**2 / area.sum()) < 0.06 * fine.mean_irradiance.mean()
+
+
+def test_links_end_where_the_elements_asked_for_end():
+    # Refined on without elements, links were 8 an element.
+    solution = solve(workbench.load("office"), elements=6000, workers=2)
+    assert 5900 < solution.mesh.element_count <= 6000
+    assert solution.record.results["links"] < 6 * solution.mesh.element_count
+
+
+def test_pieces_without_area_exchange_nothing():
+    # A corner in the middle of an edge: the last triangle of the ring's fan is a line.
+    ring = np.array([[2, 0, 0], [2, 1, 0], [0, 1, 0], [0, 0, 0], [1, 0, 0]], dtype=float)
+    lamp = np.array([[0, 0, 1], [0, 1, 1], [2, 1, 1], [2, 0, 1]], dtype=float)
+    plain = ring[:4]
+    means = []
+    for floor in (ring, plain):
+        scene = Scene(
+            "line",
+            (
+                Surface.from_polygons("floor", diffuse("floor", 0.5), [floor]),
+                Surface.from_polygons("lamp", diffuse("lamp", 0.2, 1.0), [lamp]),
+            ),
+            bands=1,
+        )
+        solution = solve(scene, link_error=2e-3)
+        assert np.isfinite(solution.radiosity).all()
+        means.append(solution.mean_irradiance[0])
+    assert means[0] == pytest.approx(means[1], rel=2e-3)
 
 
 # Stopping and refusing
