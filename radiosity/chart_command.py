@@ -41,7 +41,9 @@ LIMIT = 5.0
     metavar="KEY=V1,V2,...",
     help="Settings of a technique or of all that share KEY.",
 )
-@click.option("--reference", metavar="R", help="exact, converged, a rival, or FILE.npy.  [default: as exact as known]")
+@click.option(
+    "--reference", metavar="R", help="exact, converged, RIVAL, RIVAL:SAMPLES or FILE.npy.  [default: as exact as known]"
+)
 @click.option(
     "--repeats",
     type=click.IntRange(1, 1000),
@@ -108,9 +110,9 @@ def chart(
     where they are not installed.  Lamps reflect nothing, in all techniques.
 
     Seconds are medians, with the spread of the runs; medians whose spreads overlap, or that differ by
-    less than 5 %, are tied: nothing is said of their order.  --compare tells whether another chart was
-    reproduced: all counts and errors of our own exactly, and the order of all on the frontier that are
-    not tied.  The exit code is 1 if not.
+    less than 5 % (of single runs 25 %), are tied: nothing is said of their order.  --compare tells
+    whether another chart was reproduced: all counts and errors of our own exactly, and the order of all
+    on the frontier that are not tied.  The exit code is 1 if not.
     """
     from workbench.record import check_folder
 

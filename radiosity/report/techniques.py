@@ -129,7 +129,7 @@ class Problem:
         raise NotImplementedError
 
     def reference(self, kind: str) -> Reference:
-        """What answers are judged by: ``"exact"``, ``"converged"`` or a rival's name."""
+        """What answers are judged by: ``"exact"``, ``"converged"``, a rival's name, or ``"RIVAL:SAMPLES"``."""
         raise NotImplementedError
 
     def judged(self, values: FloatArray) -> FloatArray:
@@ -295,7 +295,12 @@ class Shadows(Problem):
         return _rival_reference(self, kind, 4096)
 
 
-def _rival_reference(problem: Problem, kind: str, samples: int) -> Reference:
+def _rival_reference(problem: Problem, asked: str, samples: int) -> Reference:
+    kind, _, given = asked.partition(":")
+    if given.isdecimal() and int(given) > 0:
+        samples = int(given)
+    elif given:
+        raise OptionError(f"reference: found {asked!r}, expected RIVAL:SAMPLES with a whole number of samples")
     if kind not in problem.names() or kind in problem.own:
         raise OptionError(
             f"reference: found {kind!r}, expected exact, converged, FILE.npy or a rival that answers this"
@@ -547,7 +552,7 @@ class Solve(Problem):
             solution = self._solved(options, seed)
             if not gather:
                 return Answer(self._read(solution), dict(solution.record.counters))
-            return Answer(*self._gathered(solution, min(0.1, 4.0 / value), seed))
+            return Answer(*self._gathered(solution, min(0.1, 4.0 / value, 60.0 / value**1.4), seed))
 
         return Technique(name, "elements", values, ask)
 
@@ -619,6 +624,7 @@ class Pictures(Problem):
     error_label = "error: rms over the pixels that see no lamp / mean radiance"
     own: tuple[str, ...] = ("aliased", "adaptive", "atomic", "gather")
     direct_only = True
+    reference_samples = 4096
 
     def __init__(self, scene: Scene, *, width: int = 96, workers: int | None = None) -> None:
         super().__init__(black_lamps(scene), workers=workers)
@@ -704,14 +710,14 @@ class Pictures(Problem):
         return Technique(name, "samples a pixel", (1, 4, 16, 64, 256, 1024, 4096), ask, kind="rival")
 
     def reference(self, kind: str) -> Reference:
-        """A final gather to 0.3 %, or 8 x 1,024 samples a pixel of a rival."""
+        """A final gather to 0.3 %, or 8 runs of a rival with ``reference_samples`` a pixel."""
         if kind == "exact":
             raise OptionError("reference: no exact picture is known; ask for converged, mitsuba or FILE.npy")
         if kind == "converged":
             return Reference(
                 "final gather to 0.3 %", self._gathered(self._source(0.003, 7), 0.003, 7).values, 0.0, 0.003
             )
-        return _rival_reference(self, kind, 1024)
+        return _rival_reference(self, kind, self.reference_samples)
 
     def _gather(self) -> Technique:
         return Technique(
@@ -748,7 +754,7 @@ class Pictures(Problem):
 class GlobalPictures(Pictures):
     """A small picture of all the light, direct and reflected. [W m-2 sr-1]"""
 
-    what, direct_only = "picture", False
+    what, direct_only, reference_samples = "picture", False, 2048
     own = ("gather", "matrix+gather", "gather-every-pixel", "mesh")
 
     def _source(self, error: float, seed: int) -> Any:

@@ -95,6 +95,7 @@ def test_pictures_of_all_light_by_every_technique():
     (["--width", "10"], "--width"),
     (["--reference", "nothing.npy", "--methods", "exact"], "nothing.npy"),
     (["--reference", "magic", "--methods", "exact"], "magic"),
+    (["--reference", "mitsuba:many", "--methods", "exact"], "RIVAL:SAMPLES"),
     (["--grid", "0x4"], "0x4"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(tmp_path, arguments, said):

@@ -241,6 +241,8 @@ def test_order_is_told_up_to_the_spread():
          *times("d", 1, 0.1, 2.0, 2.01, 2.0), *times("e", 1, 0.05, 2.07, 2.08, 2.07)]
     )  # fmt: skip
     assert not apart(a, b) and not apart(b, a) and apart(a, c) and apart(c, b)
+    one, other, far = points_of([*times("f", 1, 0.1, 1.0), *times("g", 1, 0.1, 1.2), *times("h", 1, 0.1, 1.3)])
+    assert not apart(one, other) and apart(one, far)  # of single runs no spread is known
     assert d.slow < e.quick and not apart(d, e)  # 3.5 % apart in every run, which another process may turn round
     assert [(p.method, [q.method for q in tied]) for p, tied in ranking([a, b, c, d, e])] == [
         ("a", ["b"]), ("b", ["a"]), ("d", ["e"]), ("e", ["d"]),
