@@ -66,8 +66,8 @@ MOST_TURN = 0.2
 FIRST_PLACES, MOST_PLACES = (4, 8), 4096
 """Rays from the eye in a pixel that shows an edge, before it is known how many it needs (first where the error is
 :data:`TRUSTED` or more), and the most of them."""
-INSIDE_ERROR = 0.55
-"""Share of the error that edges in pixels may make."""
+INSIDE_ERROR = (0.55, 0.35)
+"""Share of the error that edges in pixels may make, first where the error is :data:`TRUSTED` or more."""
 NET_ERROR = 0.6
 """n rays in a pixel leave this, times n^-3/4, of their standard deviation (measured)."""
 INSIDE_ROUNDS, GROWTH = 4, 8
@@ -83,7 +83,7 @@ SPACING, SPACED_FOR = 0.5, 0.02
 smaller one; as the root of the error beyond, for interpolation errs as the square of the step."""
 PILOT_RAYS = (16, 128)
 """Rays of a bundle before it is known how many are needed: as many as 0.03 of error needs, within these."""
-NODE_ERROR = 1.5
+NODE_ERROR = 1.0
 """Standard error of a node, as a share of the picture's error: a fit averages over a few nodes."""
 NOISE = 2.5
 """Standard errors of a node by which it may differ from what was foretold without being uneven."""
@@ -759,7 +759,7 @@ class _Tile:
         self.states = np.full((shape, len(self.owner.gatherer.lights)), -1, dtype=np.int8)
         self.states[whole.pixel] = straight.state
         inside = np.flatnonzero(cut)
-        allowed = (INSIDE_ERROR * self.options.error) ** 2 * shape
+        allowed = (INSIDE_ERROR[self.options.error < TRUSTED] * self.options.error) ** 2 * shape
         fragments, light, crowded = self._divide(inside, shadow[inside], corners[inside], radiance, allowed)
         self.light = _Light(
             radiance, _Fragments.joined([whole.take(kept), fragments]), np.concatenate([direct[kept], light]),
