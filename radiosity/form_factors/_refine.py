@@ -19,6 +19,7 @@ from numba import njit
 
 from radiosity.form_factors._contour import contour_integral_in
 from radiosity.form_factors._pairs import _PLAIN, CLEARS, HIDES, _axis_verdict, _heights, crossings, seen_share, verdict
+from radiosity.form_factors._ray_shares import MOST_RAYS
 from radiosity.form_factors.analytic import _clip_pair
 from workbench.culling.tally import CLOSED, COMPLEX, DARK, SHAFT_CULL, SHAFT_TEST
 from workbench.geometry.lambert import lambert_piece
@@ -30,6 +31,8 @@ MOST_CELLS = 50_000
 """Cells of a pair after which what is left counts as doubt."""
 SHORT = 48
 """Candidates of a cell that are cut at once; of a longer list the larger end is halved first."""
+REFINING_RAYS = 64 * MOST_RAYS
+"""Most rays of a pair that is refined: where they are enough, and candidates are many, they take less time."""
 
 CLOSE = 1.0
 """Height over the other end, in radii of a cell, below which the closed form of the cell is worth its time."""
@@ -581,6 +584,14 @@ def refined_exchange(
             return 0.0, 0.0, False
         arena[root] = k
         root += 1
+    if root > SHORT:
+        x, y, z, _ = _ball(pair[ring_s], 0, count_s)
+        whole = _area(pair[ring_s], 0, count_s) * max(
+            lambert_piece(x, y, z, ns[0], ns[1], ns[2], pair[ring_t], 0, count_t), 0.0
+        )
+        # Half of what may be seen is the most that one ray differs from the mean of all.
+        if 0.25 * whole * whole < tolerance * tolerance * REFINING_RAYS:
+            return 0.0, 0.0, False
     cuts = _cut_along_touching(
         pair[ring_s], count_s, ox, oy, oz, ns, nt, offset[t], kc, ks, kn, kd, klow, khigh, arena, 0, root, slack, parts,
         part_sizes,

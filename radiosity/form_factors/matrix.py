@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from radiosity.form_factors import _pairs, _stripes
 from radiosity.form_factors._covered import covered_pieces
 from radiosity.form_factors._ray_shares import MOST_RAYS, ray_shares
-from radiosity.form_factors._refine import cell_workspace
+from radiosity.form_factors._refine import REFINING_RAYS, cell_workspace
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
 from workbench.accel.embree import EmbreeAccelerator
 from workbench.culling.shaft import MAX_SHAFT_PLANES
@@ -509,7 +509,7 @@ class _Engine:
         smaller = np.minimum(self.pieces.area[i], self.pieces.area[j])
         goals = self.care.share_error * (1.0 + self.care.floor * smaller / whole)
         goals = np.minimum(goals, threshold / (whole * (importance[i] + importance[j])))
-        most = MOST_RAYS if threshold == math.inf else 64 * MOST_RAYS
+        most = MOST_RAYS if threshold == math.inf else REFINING_RAYS
         share, doubt, traced = ray_shares(pairs, goals, self.seed, self.pieces, self.tracer(), most)
         out[i - base, j] = whole * share
         spread[i - base, j] = spread[i - base, j] * share + whole * doubt
