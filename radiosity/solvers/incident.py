@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from radiosity.form_factors._sampling import place_on_pieces, stream
 from radiosity.patches import PatchMesh
+from radiosity.solvers._solid_angle import PLACES, cell_counts, places_of, solid_angles
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
 from workbench.geometry.flat import Geometry
 from workbench.scene.model import Light, Scene
@@ -32,30 +33,34 @@ FEW_ELEMENTS, MORE_POINTS = 256, 16
 UNEVEN = 0.2
 """Deviation of the light at the points of an element from which there are more, over the wanted error."""
 
+ENDS = 4.0
+"""Rays toward a lamp end so many times the tracer's offset before it."""
+
 # Generalised golden ratio in two dimensions.
 _G2 = 1.3247179572447460
 _GAUSS = 0.5 / math.sqrt(3.0)
 
 
 @njit(nogil=True, cache=True)
-def _smooth_points(corners, piece_start, element_piece, first, last, out, fits):
+def _smooth_points(corners, piece_start, element_piece, chosen, out, fits):
     """Gauss's 2 x 2 points of elements that are one parallelogram, whose weights are equal; ``fits`` tells them."""
-    for e in range(first, last):
+    for row in range(chosen.shape[0]):
+        e = chosen[row]
         a = piece_start[element_piece[e]]
-        fits[e - first] = False
+        fits[row] = False
         if element_piece[e + 1] != element_piece[e] + 1 or piece_start[element_piece[e] + 1] != a + 4:
             continue
         gap = size = 0.0
         for axis in range(3):
             gap += abs(corners[a, axis] + corners[a + 2, axis] - corners[a + 1, axis] - corners[a + 3, axis])
             size += abs(corners[a + 2, axis] - corners[a, axis])
-        fits[e - first] = gap <= 1e-3 * size
+        fits[row] = gap <= 1e-3 * size
         for k in range(4):
             u, v = 0.5 + (_GAUSS if k & 1 else -_GAUSS), 0.5 + (_GAUSS if k & 2 else -_GAUSS)
             for axis in range(3):
-                out[(e - first) * 4 + k, axis] = (1.0 - v) * (
-                    (1.0 - u) * corners[a, axis] + u * corners[a + 1, axis]
-                ) + v * ((1.0 - u) * corners[a + 3, axis] + u * corners[a + 2, axis])
+                out[row * 4 + k, axis] = (1.0 - v) * ((1.0 - u) * corners[a, axis] + u * corners[a + 1, axis]) + v * (
+                    (1.0 - u) * corners[a + 3, axis] + u * corners[a + 2, axis]
+                )
 
 
 @njit(nogil=True, cache=True)
@@ -87,42 +92,41 @@ def _points(mesh: PatchMesh, chosen: IntArray, count: int, seed: int) -> tuple[F
 
 
 def _from_light(
-    light: Light, points: FloatArray, normals: FloatArray, tracer: EmbreeAccelerator, k: int
-) -> tuple[FloatArray, FloatArray]:
-    """Irradiance per unit power at points, from a light without surface or one sample of it: unoccluded, and seen."""
+    light: Light, place: FloatArray | None, points: FloatArray, normals: FloatArray, tracer: EmbreeAccelerator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Irradiance per unit power at points from a light without surface, or per length from a ``place`` of a line.
+
+    As if it shone evenly, with its fall-off, and with what hides it.
+    """
     start = points + tracer.offset * normals
+    far: float | FloatArray
     if light.kind == "directional":
         assert light.direction is not None
         toward = np.broadcast_to(-light.direction, points.shape)
-        cosine = np.maximum(np.einsum("ij,ij->i", normals, toward), 0.0)
-        lit = np.flatnonzero(cosine > 0)
-        seen = cosine.copy()
-        seen[lit[tracer.occluded(start[lit], toward[lit], np.inf)]] = 0.0
-        return cosine, seen
-    assert light.position is not None
-    place = light.position
-    length = 1.0
-    if light.kind == "linear":
-        assert light.end is not None
-        place = light.position + (k + 0.5) / POINTS * (light.end - light.position)
-        length = float(np.linalg.norm(light.end - light.position))
-    toward = place - points
-    distance = np.linalg.norm(toward, axis=1)
-    safe = np.where(distance > 0, distance, 1.0)
-    value = np.maximum(np.einsum("ij,ij->i", normals, toward), 0.0) / safe**3 * length
-    if light.kind == "spot":
-        assert light.direction is not None
-        along = -(toward @ light.direction) / safe
-        inside = along >= math.cos(math.radians(light.cone_deg))
-        value *= np.where(inside, np.maximum(along, 0.0) ** light.exponent, 0.0)
-    elif light.kind == "linear" and light.lambertian:
-        assert light.end is not None
-        axis = (light.end - light.position) / length
-        value *= np.sqrt(np.maximum(1.0 - ((toward @ axis) / safe) ** 2, 0.0))
+        value = even = np.maximum(np.einsum("ij,ij->i", normals, toward), 0.0)
+        far = np.inf
+    else:
+        assert place is not None
+        toward = place - points
+        distance = np.linalg.norm(toward, axis=1)
+        safe = np.where(distance > 0, distance, 1.0)
+        value = even = np.maximum(np.einsum("ij,ij->i", normals, toward), 0.0) / safe**3
+        toward = place - start
+        # A lamp may lie on a ceiling, which does not hide it.
+        far = np.clip(1.0 - ENDS * tracer.offset / safe, 0.0, 1.0)
+        if light.kind == "spot":
+            assert light.direction is not None
+            along = (points - place) @ light.direction / safe
+            inside = along >= math.cos(math.radians(light.cone_deg))
+            value = even * np.where(inside, np.maximum(along, 0.0) ** light.exponent, 0.0)
+        elif light.kind == "linear" and light.lambertian:
+            assert light.end is not None and light.position is not None
+            axis = (light.end - light.position) / np.linalg.norm(light.end - light.position)
+            value = even * np.sqrt(np.maximum(1.0 - (((points - place) @ axis) / safe) ** 2, 0.0))
     lit = np.flatnonzero(value > 0)
     seen = value.copy()
-    seen[lit[tracer.occluded(start[lit], place - start[lit], 1.0)]] = 0.0
-    return value, seen
+    seen[lit[tracer.occluded(start[lit], toward[lit], np.broadcast_to(far, len(points))[lit])]] = 0.0
+    return even, value, seen
 
 
 def _light_means(
@@ -130,20 +134,53 @@ def _light_means(
 ) -> FloatArray:
     """Mean irradiance (elements,) per unit power, from a light without surface.
 
-    Points at random places of their strata see how much of the light is hidden; what is not hidden
-    is smooth and integrated by Gauss's rule, on elements that are parallelograms.
+    Solid angles say what an even light sends unhindered (:mod:`radiosity.solvers._solid_angle`).  Points at random
+    places of their strata see how much of the light is hidden; its fall-off is smooth and integrated by Gauss's rule,
+    on elements that are parallelograms and that no cone's edge crosses.
     """
-    points, normals = _points(mesh, np.arange(first, last), POINTS, seed)
-    smooth, fits = np.zeros_like(points), np.zeros(last - first, dtype=np.bool_)
-    _smooth_points(mesh.corners, mesh.piece_start, mesh.element_piece, first, last, smooth, fits)
     total = np.zeros(last - first)
-    samples = POINTS if light.kind == "linear" else 1
-    for k in range(samples):
-        whole, seen = (v.reshape(-1, POINTS).mean(axis=1) for v in _from_light(light, points, normals, tracer, k))
-        better = _from_light(light, smooth, normals, tracer, k)[0].reshape(-1, POINTS).mean(axis=1)
-        share = np.divide(seen, whole, out=np.zeros_like(seen), where=whole > 0)
-        total += np.where(fits & (whole > 0), better * share, seen) / samples
+    if light.kind == "directional":
+        points, normals = _points(mesh, np.arange(first, last), POINTS, seed)
+        return _from_light(light, None, points, normals, tracer)[2].reshape(-1, POINTS).mean(axis=1)
+    cells, places = cell_counts(light, mesh, first, last)
+    for cell, count in {(int(a), int(b)) for a, b in zip(cells, places, strict=True)}:
+        group = first + np.flatnonzero((cells == cell) & (places == count))
+        step = max(1, BLOCK_RAYS // max(cell * cell, POINTS))
+        for begin in range(0, len(group), step):
+            chosen = group[begin : begin + step]
+            total[chosen - first] = _means_of(light, mesh, chosen, cell, count, seed, tracer)
     return total
+
+
+def _means_of(
+    light: Light, mesh: PatchMesh, chosen: IntArray, cells: int, count: int, seed: int, tracer: EmbreeAccelerator
+) -> FloatArray:
+    """:func:`_light_means` of chosen elements, by ``cells`` a side (0: few points) and ``count`` places of a line."""
+    samples = max(cells * cells, POINTS)
+    points = points_of_elements(mesh, chosen, samples, seed)
+    normals = np.repeat(mesh.element_normal[chosen], samples, axis=0)
+    smooth, fits = np.zeros((len(chosen) * POINTS, 3)), np.zeros(len(chosen), dtype=np.bool_)
+    bundled = (light.kind == "spot" and light.exponent > 0) or light.lambertian
+    if bundled and not cells:
+        _smooth_points(mesh.corners, mesh.piece_start, mesh.element_piece, chosen, smooth, fits)
+    total, whole = np.zeros(len(chosen)), np.empty(len(chosen))
+    for place in places_of(light, count):
+        solid_angles(mesh.corners, mesh.piece_start, mesh.element_piece, mesh.element_normal, chosen, place, whole)
+        even, value, seen = (
+            each.reshape(-1, samples).sum(axis=1) for each in _from_light(light, place, points, normals, tracer)
+        )
+        part = np.divide(seen, even, out=np.zeros_like(seen), where=even > 0)
+        if fits.any():
+            toward = _from_light(light, place, smooth, np.repeat(mesh.element_normal[chosen], POINTS, axis=0), tracer)
+            flat, bundle = (each.reshape(-1, POINTS).sum(axis=1) for each in toward[:2])
+            share = np.divide(seen, value, out=np.zeros_like(seen), where=value > 0)
+            falls = np.divide(bundle, flat, out=np.zeros_like(flat), where=flat > 0)
+            part = np.where(fits & (value > 0), falls * share, part)
+        total += whole * part
+    part_length = 1.0
+    if light.end is not None and light.position is not None:
+        part_length = float(np.linalg.norm(light.end - light.position)) / count
+    return total * (part_length / mesh.element_area[chosen])
 
 
 def _from_sky(
@@ -277,9 +314,12 @@ def incident_spread(
         points, normals = _points(mesh, np.arange(first, last), MORE_POINTS, seed)
         total = np.zeros((last - first, MORE_POINTS, mesh.bands))
         for light in scene.lights:
-            samples = POINTS if light.kind == "linear" else 1
-            seen = sum(_from_light(light, points, normals, tracer, k)[1] for k in range(samples)) / samples
-            total += np.asarray(seen).reshape(-1, MORE_POINTS, 1) * light.power
+            places = [None] if light.kind == "directional" else list(places_of(light, PLACES))
+            seen = [_from_light(light, place, points, normals, tracer)[2] for place in places]
+            length = 1.0
+            if light.end is not None and light.position is not None:
+                length = float(np.linalg.norm(light.end - light.position))
+            total += np.mean(seen, axis=0).reshape(-1, MORE_POINTS, 1) * (length * light.power)
         out[first:last] = total.std(axis=1)
     sky = SkyLight.of_scene(scene)
     if sky is not None:
