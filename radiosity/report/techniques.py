@@ -398,7 +398,14 @@ class ViewFactors(Problem):
         np.add.at(total, owner, per_point * weight[:, None])
         return total
 
+    def _no_panes(self, name: str) -> None:
+        """Refuse panes for a technique that ends at the first surface met."""
+        for material in self.geometry.surface_material:
+            if material.transmittance.any():
+                raise OptionError(f"{name}: found the pane {material.name!r}, which it takes for opaque; leave it out")
+
     def _hemicube(self) -> Technique:
+        self._no_panes("hemicube")
         from workbench.accel.box_tree import BoxTree
         from workbench.shadow.hemicube import hemicube_deltas, hemicube_items
 
@@ -422,6 +429,7 @@ class ViewFactors(Problem):
         return Technique("hemicube", "hemicubes a polygon", (1, 4, 16, 64, 256), ask)
 
     def _rays(self) -> Technique:
+        self._no_panes("rays")
         from workbench.accel.embree import EmbreeAccelerator
         from workbench.geometry.polygons import plane_basis
         from workbench.sampling.sequences import owen_sobol

@@ -6,7 +6,7 @@ Form factors between all polygons of a scene by ``view_factors`` to several erro
 and hemisphere rays with settings by hand, interleaved.  The reference is exact cuts to 1e-6, and where polygons
 are many 67 million rays, whose noise is taken off.  Rows as in ``bench_shadow_methods.py``: errors are
 root mean squares over the pairs relative to the mean, seconds are of the processor, the least of the repeats.
-Two-sided surfaces count by their front.  Without scenes: the built-in ones of up to 3,000 polygons, and those of
+Two-sided surfaces count by their front, panes as opaque.  Without scenes: the built-in ones of up to 3,000 polygons, and those of
 ``../shared/scenes-external`` where they are found.
 """
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
+import numpy as np
 from bench_shadow_methods import HERE, ratios
 
 import workbench
@@ -49,10 +50,12 @@ def scenes() -> list[str]:
 
 
 def one_sided(scene: Scene) -> Scene:
-    """The scene with every surface seen from its front alone."""
-    return replace(
-        scene, surfaces=tuple(replace(s, material=replace(s.material, two_sided=False)) for s in scene.surfaces)
-    )
+    """The scene with every surface seen from its front alone, and opaque."""
+    changed = [
+        replace(s, material=replace(s.material, two_sided=False, transmittance=np.zeros_like(s.material.transmittance)))
+        for s in scene.surfaces
+    ]
+    return replace(scene, surfaces=tuple(changed))
 
 
 def reference(problem: ViewFactors) -> Reference:

@@ -31,7 +31,7 @@ from radiosity.report.speed_accuracy import (
     seconds_to,
     write_runs,
 )
-from radiosity.report.techniques import Answer, Problem, Reference, Technique
+from radiosity.report.techniques import Answer, Problem, Reference, Technique, problem_for
 from workbench.errors import InputError, OptionError
 from workbench.scene.library import diffuse, unit_cube
 
@@ -317,3 +317,15 @@ def test_page_is_whole_and_escaped():
     page = html_page("a < b", "<?xml?><svg>x</svg>", {"T": [{"m": "<rays>", "n": "1.5"}]}, ["n & m"], {"cores": 2})
     assert page.startswith("<!doctype html>") and "<svg>x</svg>" in page and "<?xml" not in page
     assert "&lt;rays&gt;" in page and "n &amp; m" in page and "http" not in page
+
+
+def test_samplers_of_view_factors_refuse_panes():
+    """A ray or a pixel ends at a pane, behind which view factors go on."""
+    pane = replace(diffuse("pane", 0.0), transmittance=np.array([0.5]))
+    scene = unit_cube(0.5, 1.0)
+    scene = replace(scene, surfaces=(*scene.surfaces[:5], replace(scene.surfaces[5], material=pane)))
+    problem = problem_for("viewfactors", scene, workers=1)
+    for name in ("rays", "hemicube"):
+        with pytest.raises(OptionError, match="pane"):
+            problem.technique(name)
+    assert problem.technique("auto").kind == "auto"
