@@ -6,8 +6,8 @@ Form factors between all polygons of a scene by ``view_factors`` to several erro
 and hemisphere rays with settings by hand, interleaved.  The reference is exact cuts to 1e-6, and where polygons
 are many 67 million rays, whose noise is taken off.  Rows as in ``bench_shadow_methods.py``: errors are
 root mean squares over the pairs relative to the mean, seconds are of the processor, the least of the repeats.
-Two-sided surfaces count by their front, panes as opaque.  Without scenes: the built-in ones of up to 3,000 polygons, and those of
-``../shared/scenes-external`` where they are found.
+Two-sided surfaces count by their front, panes as opaque.  Without scenes: the built-in ones of up to 3,000
+polygons, and those of ``../shared/scenes-external`` where they are found.
 """
 
 from __future__ import annotations
