@@ -31,6 +31,9 @@ CELLS_A_CONE, LEAST_IN_CONE = 16.0, 8.0
 """Cells over the half-width of a cone's disk on an element that its edge crosses: they leave 0.3 % of its light."""
 CELLS_A_BEAM, BEAM = 8.0, 3.5
 """Cells over the width, 1 / sqrt(n), of a beam of cos^n, and how many widths of it count."""
+SUN_POINTS = 1 << 17
+"""Points that look for parallel light, spread by area over what faces it: it may come through a small window."""
+MOST_SUN_CELLS = 256
 CELLS_A_DISTANCE = 2.0
 """Cells over an element's distance from the light, for what may hide a part of it."""
 
@@ -70,6 +73,13 @@ def places_of(light: Light, count: int) -> FloatArray:
 
 def cell_counts(light: Light, mesh: PatchMesh, first: int, last: int) -> tuple[IntArray, IntArray]:
     """Cells an axis and places along the light, (elements,) each; 0 cells where the usual points do."""
+    if light.kind == "directional":
+        assert light.direction is not None
+        facing = mesh.element_normal @ light.direction < 0.0
+        share = np.where(facing, mesh.element_area, 0.0)[first:last] / max(mesh.element_area[facing].sum(), 1e-300)
+        sides = np.sqrt(SUN_POINTS * share)
+        cells = np.where(sides > 2.0, 2.0 ** np.round(np.log2(np.clip(sides, 1.0, MOST_SUN_CELLS))), 0.0)
+        return cells.astype(np.int64), np.ones(last - first, dtype=np.int64)
     centroid, size = mesh.element_centroid[first:last], mesh.element_size[first:last]
     gap = np.full(last - first, np.inf)
     for place in places_of(light, MOST_PLACES):

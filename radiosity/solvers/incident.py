@@ -139,9 +139,6 @@ def _light_means(
     on elements that are parallelograms and that no cone's edge crosses.
     """
     total = np.zeros(last - first)
-    if light.kind == "directional":
-        points, normals = _points(mesh, np.arange(first, last), POINTS, seed)
-        return _from_light(light, None, points, normals, tracer)[2].reshape(-1, POINTS).mean(axis=1)
     cells, places = cell_counts(light, mesh, first, last)
     for cell, count in {(int(a), int(b)) for a, b in zip(cells, places, strict=True)}:
         group = first + np.flatnonzero((cells == cell) & (places == count))
@@ -159,6 +156,8 @@ def _means_of(
     samples = max(cells * cells, POINTS)
     points = points_of_elements(mesh, chosen, samples, seed)
     normals = np.repeat(mesh.element_normal[chosen], samples, axis=0)
+    if light.kind == "directional":  # even over an element, but for what hides it
+        return _from_light(light, None, points, normals, tracer)[2].reshape(-1, samples).mean(axis=1)
     smooth, fits = np.zeros((len(chosen) * POINTS, 3)), np.zeros(len(chosen), dtype=np.bool_)
     bundled = (light.kind == "spot" and light.exponent > 0) or light.lambertian
     if bundled and not cells:

@@ -9,7 +9,7 @@ import pytest
 
 import radiosity
 from workbench.scene.library import box_surface, diffuse
-from workbench.scene.model import Light, Scene
+from workbench.scene.model import Light, Scene, Surface
 
 ONE = np.ones(1)
 LENGTH = 1.97
@@ -87,3 +87,17 @@ def _beside():
         return math.atan(a * b / (h * math.sqrt(a * a + b * b + h * h)))
 
     return 2 * math.pi - 4 * quarter(*corner)
+
+
+@pytest.mark.parametrize("elements", [6, 500])
+def test_the_sun_shines_through_a_small_window(elements):
+    # Four points of each element found no light at all on the six elements of this room.
+    walls = box_surface("walls", diffuse("walls", 0.0), [0, 0, 0], [4, 3, 2.5], inward=True, omit=["+z"])
+    ring = [[0, 0, 2.5], [0, 3, 2.5], [4, 3, 2.5], [4, 0, 2.5]]
+    hole = [[1.1, 1.2, 2.5], [1.8, 1.2, 2.5], [1.8, 1.7, 2.5], [1.1, 1.7, 2.5]]
+    roof = Surface.from_polygons("roof", diffuse("roof", 0.0), [[np.array(ring, float), np.array(hole)]])
+    direction = np.array([0.31, 0.17, -1.0]) / np.linalg.norm([0.31, 0.17, -1.0])
+    scene = Scene("room", (walls, roof), lights=(Light("sun", "directional", ONE, direction=direction),), bands=1)
+    solution = radiosity.solve(scene, elements=elements, workers=1)
+    arrived = solution.mesh.element_area @ solution.element_irradiance[:, 0]
+    assert arrived == pytest.approx(0.7 * 0.5 * -direction[2], rel=0.02)

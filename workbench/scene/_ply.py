@@ -1,8 +1,9 @@
 """PLY files (G. Turk, "The PLY Polygon File Format", Stanford 1994) with their polygons whole.
 
-trimesh cuts polygons into fans, which is wrong for concave ones, and cannot read binary files that mix triangles with
-quads; meshio refuses edges, lists of texture coordinates and most names of types; plyfile is under the GPL, which this
-project is not.
+No library at hand will do: trimesh cuts polygons into fans, which is wrong for concave ones, and cannot read
+binary files that mix triangles with quads; VTK keeps coordinates in single precision, believes indices out of range
+and dies on a binary file cut short; meshio refuses edges, lists of texture coordinates and most names of types;
+plyfile is under the GPL, which this project is not.
 """
 
 from __future__ import annotations
