@@ -70,6 +70,8 @@ INSIDE_ERROR = (0.55, 0.35)
 """Share of the error that edges in pixels may make, first where the error is :data:`TRUSTED` or more."""
 NET_ERROR = 0.6
 """n rays in a pixel leave this, times n^-3/4, of their standard deviation (measured)."""
+PIXEL_ERROR = 4.0
+"""Error of any one of these pixels, as a multiple of the picture's: more would show as specks."""
 INSIDE_ROUNDS, GROWTH = 4, 8
 """Rounds in which such rays are added, and how many times as many a pixel has after one."""
 CORNER_SHARE = 0.25
@@ -871,12 +873,15 @@ class _Tile:
             if allowed is None or not len(pixels):
                 break
             variance = _variances(moments)
-            if variance.sum() <= allowed:
+            worst = (PIXEL_ERROR * self.options.error) ** 2
+            if variance.sum() <= allowed and variance.max() <= worst:
                 break
             # What the most rays leave has to be borne.
             least = 1.5 * float((variance * (count / MOST_PLACES) ** 1.5).sum())
             target = allotted(variance[:, None], count, np.array([max(allowed, least) / len(pixels)]), MOST_PLACES)
-            target = np.minimum(target, GROWTH * count)
+            needed = count * np.maximum(variance / worst, 1.0) ** (2.0 / 3.0)
+            target = np.maximum(target, 2 ** np.ceil(np.log2(needed)).astype(np.int64))
+            target = np.minimum(target, np.minimum(GROWTH * count, MOST_PLACES))
         radiance[pixels] = seen / np.maximum(count, 1)[:, None]
         self.samples["camera"][pixels] += count
         if not parts:
