@@ -110,6 +110,8 @@ COARSER = (16.0, 16.0, 4.0, 1.0)
 """Link errors of the rounds in units of the last: emitters first, then with what they lit, then finer."""
 EXACT_ELEMENTS, EXACT = 12, 1e-8
 """Up to this many elements, if no more may be made, form factors are found to this error: a second at most."""
+LEAST_SPLIT = 3
+"""Elements that a quad or triangle becomes more when it is split."""
 ELEMENTS_FALL = 0.8
 """Power of the number of elements with which the link error falls (seen on rooms)."""
 FIRST_ERROR, LAST_ERROR = 1e-2, 1e-7
@@ -1045,7 +1047,9 @@ def _next_error(solver: _Solver, state: _Round, link_error: float | None) -> flo
     else:
         assert solver.max_elements is not None
         share = solver.tree.leaf_count / solver.max_elements
-        finer = share < 0.98 and state.error > LAST_ERROR
+        # With no room for another split only links would be refined, to no end.
+        room = solver.max_elements - solver.tree.leaf_count
+        finer = share < 0.98 and room >= LEAST_SPLIT and state.error > LAST_ERROR
         # No smaller than the elements last, or links alone are refined.
         error = max(0.5, share**ELEMENTS_FALL) * state.error if finer else state.error
     # Light that goes round more corners than there were rounds.

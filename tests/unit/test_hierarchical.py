@@ -442,6 +442,17 @@ def test_links_end_where_the_elements_asked_for_end():
     assert solution.record.results["links"] < 6 * solution.mesh.element_count
 
 
+def test_links_are_not_refined_where_no_element_fits(monkeypatch):
+    # 8 asked, 6 there are: a split makes 9. Links were refined to the least error there is, for a minute in a room.
+    errors = []
+    refine = hierarchical._Solver.refine
+    monkeypatch.setattr(
+        hierarchical._Solver, "refine", lambda self, error, report: errors.append(error) or refine(self, error, report)
+    )
+    assert solve(cube_with_emitter(0.2, 0.7), elements=8).mesh.element_count == 6
+    assert len(errors) <= 4 and min(errors) >= 1e-3
+
+
 def test_pieces_without_area_exchange_nothing():
     # A corner in the middle of an edge: the last triangle of the ring's fan is a line.
     ring = np.array([[2, 0, 0], [2, 1, 0], [0, 1, 0], [0, 0, 0], [1, 0, 0]], dtype=float)
