@@ -29,6 +29,7 @@ from radiosity.form_factors._sampling import place_on_pieces
 from radiosity.mesh_choice import Divisions, like_elements
 from radiosity.patches import PatchMesh, build_mesh
 from radiosity.sensors import Gatherer
+from radiosity.solve_costs import expected_seconds
 from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, Solution
 from radiosity.solvers.solve import (
     MATRIX_POLYGONS,
@@ -86,8 +87,8 @@ LEAST_GROWTH, MOST_STUCK = 1.3, 8
 """Growth below which a mesh counts as the same, and how often the number asked for is doubled then."""
 AMPLE = 1.15
 """Growth beyond what the estimate asks for: another mesh costs more than a larger one."""
-GROWTH = (1.6, 8.0)
-"""Least and largest growth of the number of elements from mesh to mesh."""
+GROWTH, FIRST_GROWTH = (1.6, 8.0), 3
+"""Least and largest growth of the number of elements from mesh to mesh; and that to a mesh which shows a difference."""
 COST_POWER = 1.7
 """Power of the number of elements with which the seconds grow."""
 GATHERED = 5.0
@@ -377,8 +378,9 @@ def _look(gatherer: Gatherer, where: tuple[FloatArray, FloatArray, IntArray], ro
 
 
 def _effort(run: _Run, elements: int) -> int:
-    """Row of :data:`LOOKS` for the asked error, or for what so many elements may reach."""
-    wanted = run.target if run.target > 0 else _room_error(elements)
+    """Row of :data:`LOOKS` for the asked error, or for what so many elements may reach if that is more."""
+    # A first mesh that is far too coarse needs no close look.
+    wanted = max(run.target, _room_error(elements))
     return next(row for row, (error, *_) in enumerate(LOOKS) if wanted >= error)
 
 
@@ -410,10 +412,21 @@ def _method(scene: Scene, run: _Run) -> str:
     if asked != "auto":
         return asked
     polygons = sum(surface.face_count for surface in scene.surfaces)
+    rough = _first_error(run) >= LINKS_ERROR and run.options.get("bundles", "receiver") == "receiver"
     if polygons <= MATRIX_POLYGONS:
         run.choices["method"] = f"matrix: {polygons} polygons, all form factors at once up to {MATRIX_POLYGONS}"
+        if rough and polygons:
+            pieces, need = len(Geometry.from_scene(scene).piece_start) - 1, _first_count(run)
+            size = {"polygons": polygons, "pieces": pieces}
+            whole = expected_seconds("matrix", **size, elements=max(need, polygons))
+            # By links a second mesh shows what the first one leaves.
+            links = sum(expected_seconds("hierarchical", **size, elements=n) for n in (need, FIRST_GROWTH * need))
+            method = "hierarchical" if links < whole else "matrix"
+            told = f"{whole:.2g} s expected of the full matrix, {links:.2g} s of links"
+            run.choices["method"] = f"{method}: {polygons} polygons in {pieces} pieces, {told}"
+            return method
         return "matrix"
-    if _first_error(run) >= LINKS_ERROR and run.options.get("bundles", "receiver") == "receiver":
+    if rough:
         run.choices["method"] = f"hierarchical: {polygons} polygons, and no less than {LINKS_ERROR:g} asked"
         return "hierarchical"
     run.choices["method"] = f"progressive: {polygons} polygons, whose small facets are clustered"
@@ -690,7 +703,7 @@ def _refine(
             return _finish(run, solution, estimate, "the estimate is below the target")
         if len(run.levels) >= MOST_LEVELS:
             return _finish(run, solution, estimate, f"{MOST_LEVELS} meshes did not reach the target")
-        want = 3.0 if not math.isfinite(meshing) else GROWTH[1]
+        want = FIRST_GROWTH if not math.isfinite(meshing) else GROWTH[1]
         if run.target > 0 and math.isfinite(meshing):
             want = (meshing / (MESHING_SHARE * run.target)) ** (1.0 / order) * AMPLE
             if estimate.form_factors > 0.3 * run.target:
@@ -702,8 +715,7 @@ def _refine(
             return _finish(run, solution, estimate, "another mesh would not fit into the time")
         count = levels.finer(solution, min(want, max(fits, GROWTH[0])))
         if len(run.levels) == 1 and count < run.guess <= fits * n:
-            # One small mesh tells but roughly: the first guess counts as much.
-            count = math.ceil(math.sqrt(count * run.guess))
+            count = math.ceil(run.guess)  # one small mesh tells whether the guess was too high, but hardly by how much
         if method == "matrix" and count > most_matrix_elements():
             count = most_matrix_elements()
             if count < GROWTH[0] * n:

@@ -26,8 +26,8 @@ ERRORS = (0.1, 0.05, 0.02, 0.01)
 PLAN = [
     ("auto", ERRORS),
     ("matrix+gather", (16, 50, 100, 200, 400, 800, 1600)),
-    ("progressive+gather", (16, 50, 200, 800, 3200)),
-    ("hierarchical+gather", (100, 200, 400, 800, 3200)),
+    ("progressive+gather", (16, 50, 200, 800)),
+    ("hierarchical+gather", (100, 200, 400, 800)),
 ]
 EXTERNAL = (
     "cornell-mcguire/CornellBox-Original.obj", "cornell-mcguire/CornellBox-Sphere.obj", "radiance-room/room.rad",

@@ -1,0 +1,77 @@
+"""What a solve will cost, told before it is made: by method, from numbers of polygons, pieces and elements.
+
+The committed table holds processor seconds of one machine; only their ratios decide.  It is fitted to runs
+by ``python tests/speed/fit_solve_costs.py``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from workbench.errors import InputError
+
+__all__ = ["TABLE", "expected_seconds", "features", "fit", "read_table"]
+
+TABLE = Path(__file__).with_name("solve_costs.json")
+"""Method to the seconds of each of its features."""
+
+
+def features(method: str, *, polygons: int, pieces: int, elements: int) -> dict[str, float]:
+    """What the seconds of a method go with.
+
+    Parameters
+    ----------
+    method : str
+        ``matrix`` (pairs of convex pieces) or ``hierarchical`` (polygons, which make the tree; elements, whose links
+        are refined).
+    polygons, pieces : int
+        Of the scene: polygons, and the convex pieces that they are cut into.
+    elements : int
+        Of the mesh.
+    """
+    if method == "matrix":
+        # Each piece is at least an element's, however coarse the mesh.
+        return {"start": 1.0, "pair": 0.5 * float(max(pieces, elements + pieces - polygons)) ** 2}
+    return {"start": 1.0, "polygon": float(polygons), "element": float(elements)}
+
+
+def fit(rows: Sequence[tuple[Mapping[str, float], float]]) -> dict[str, float]:
+    """Non-negative least squares of relative errors over (features, processor seconds) of runs of one method."""
+    names = list(rows[0][0])
+    seconds = np.array([used for _, used in rows])
+    table: NDArray[np.float64] = np.array([[row[name] for name in names] for row, _ in rows]) / seconds[:, None]
+    scale = table.max(axis=0)
+    found, _ = nnls(table / scale, np.ones(len(rows)))
+    return {name: float(value) for name, value in zip(names, found / scale, strict=True)}
+
+
+@cache
+def read_table(path: Path = TABLE) -> dict[str, dict[str, float]]:
+    """The table of a file.
+
+    Raises
+    ------
+    InputError
+        If it holds none.
+    """
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        return {method: {name: float(s) for name, s in row.items()} for method, row in stored.items()}
+    except (OSError, ValueError, TypeError, AttributeError) as problem:
+        raise InputError(f"{path}: found no table of costs ({problem})") from None
+
+
+def expected_seconds(method: str, *, polygons: int, pieces: int, elements: int) -> float:
+    """Processor seconds of a solve on the machine of the table; see :func:`features`."""
+    row = read_table()[method]
+    return sum(
+        row[name] * count
+        for name, count in features(method, polygons=polygons, pieces=pieces, elements=elements).items()
+    )
