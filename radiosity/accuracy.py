@@ -533,6 +533,10 @@ class _Patches:
             difference = max(difference, _surface_difference(solution, coarse, mean))
         return difference, _like(coarse)
 
+    def like(self, solution: Solution) -> float:
+        """How many elements alike a mesh is as good as."""
+        return _like(solution)
+
     def finer(self, solution: Solution, times: float) -> int:
         """Elements of a mesh with so many times more where it is divided: the rest is small."""
         members = np.diff(solution.mesh.patch_start)
@@ -583,8 +587,9 @@ class _Meshes:
             self.seen = np.asarray(stored)
 
     def first(self) -> int:
-        """Number of elements of the first mesh."""
-        return _first_count(self.run)
+        """Number of elements of the first mesh, which shows nothing before there is another."""
+        _first_count(self.run)
+        return math.ceil(self.run.guess)
 
     def solve(self, count: int, stoppable: bool) -> Solution:
         """Solve a mesh of about so many elements."""
@@ -635,6 +640,10 @@ class _Meshes:
     def _row(self) -> int:
         """Row of :data:`LOOKS`, one for all meshes: they are compared at the same points."""
         return _effort(self.run, BUDGET_ELEMENTS)
+
+    def like(self, solution: Solution) -> float:
+        """Its number of elements: clusters of facets come in steps of which their areas tell nothing."""
+        return float(solution.mesh.element_count)
 
     def finer(self, solution: Solution, times: float) -> int:
         """Elements of a mesh with so many times more."""
@@ -687,7 +696,7 @@ def _refine(
         start = time.perf_counter()
         difference, coarse = levels.compare(solution)
         best, stuck = solution, 0
-        like = _like(solution)
+        like = levels.like(solution)
         run.levels.append({"elements": n, "like": like, "coarse_like": coarse, "difference": difference})
         order = _order(run.levels)
         if method == "hierarchical":
