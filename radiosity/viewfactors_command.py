@@ -168,5 +168,10 @@ def _summary(found: ViewFactors) -> list[str]:
         f"reciprocity error: {found.reciprocity:.2g}; stated error, mean of the rows: "
         f"{record.errors['stated_row_error']:.2g}"
     )
+    asked, stated = record.settings["error"], record.errors["stated_row_error"]
+    if stated > asked:
+        lines.append(
+            f"asked for {asked:g}, not reached: {stated:.2g}; divide large polygons by --max-edge, or ask for more"
+        )
     lines.append("seconds: " + "; ".join(f"{stage} {spent:.2f}" for stage, spent in record.seconds.items()))
     return lines

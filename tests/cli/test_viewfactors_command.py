@@ -60,3 +60,17 @@ def test_ctrl_c_leaves_nothing(tmp_path):
     _, complaint = work.communicate(timeout=60)
     assert work.returncode == 130 and "nothing more was written" in complaint
     assert not list(tmp_path.iterdir())
+
+
+def test_an_error_that_is_not_reached_is_said(tmp_path, monkeypatch):
+    from click.testing import CliRunner
+
+    from radiosity.cli import main
+    from radiosity.form_factors import matrix
+
+    monkeypatch.setattr(matrix, "REFINEMENTS", 0)
+    arguments = ["viewfactors", "l-room", "-o", str(tmp_path / "F.npz"), "--error", "1e-5"]
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 0 and "asked for 1e-05, not reached" in done.output
+    monkeypatch.undo()
+    assert "not reached" not in CliRunner().invoke(main, arguments).output
