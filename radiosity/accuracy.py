@@ -703,7 +703,11 @@ def _refine(
             order = min(order, LINK_ORDER)
         meshing = math.inf
         if difference is not None:
-            meshing = difference / ((like / coarse) ** order - 1.0) if difference > 0 else 0.0
+            growth = like / coarse
+            if method == "hierarchical":
+                # Links are as coarse as the elements are few, however alike these are.
+                growth = min(growth, n / run.levels[-2]["elements"])
+            meshing = difference / (growth**order - 1.0) if difference > 0 else 0.0
         estimate = _parts(solution, meshing, run.scale)
         now = time.perf_counter()
         run.spent["error estimate"] = run.spent.get("error estimate", 0.0) + now - start
