@@ -151,10 +151,19 @@ def _summary(found: ViewFactors) -> list[str]:
     record, counts = found.record, found.record.counters
     sums, closed = record.errors["row_sum_as_found"], record.errors["row_sum"]
     form = "sparse" if found.sparse else "dense"
+    if record.results["method"] == "hemisphere rays":
+        predicted = record.results["predicted_seconds"]
+        how = (
+            f"{counts['rays']:,} rays from the rows, predicted to take {predicted['hemisphere rays']:.2g} s "
+            f"where pairs of polygons take {predicted['pairs']:.2g} s"
+        )
+    else:
+        how = (
+            f"{counts['not_inshadow']:,} pairs clear, {counts['inshadow']:,} hidden by one occluder, "
+            f"{counts['complex_shadow']:,} seen in part ({counts['exact_cuts']:,} exact cuts, {counts['rays']:,} rays)"
+        )
     lines = [
-        f"{record.settings['scene']}: {len(found.names)} x {len(found.names)} view factors, {form}; "
-        f"{counts['not_inshadow']:,} pairs clear, {counts['inshadow']:,} hidden by one occluder, "
-        f"{counts['complex_shadow']:,} seen in part ({counts['exact_cuts']:,} exact cuts, {counts['rays']:,} rays)",
+        f"{record.settings['scene']}: {len(found.names)} x {len(found.names)} view factors, {form}; {how}",
         f"row sums as found: min {sums['min']:.6f}, mean {sums['mean']:.6f}, max {sums['max']:.6f}",
     ]
     if found.closure_correction > 0:

@@ -23,6 +23,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -209,7 +210,7 @@ def bundle_planes(ring: int, sector: int, rings: int, sectors: int, normal: Floa
 # ---- the engine -------------------------------------------------------------------------------
 
 
-def _element_geometry(mesh: PatchMesh) -> tuple[Geometry, IntArray, IntArray]:
+def element_geometry(mesh: Any) -> tuple[Geometry, IntArray, IntArray]:
     """What rays meet, a polygon an element; the element of each, and the one on its other side or -1."""
     front = np.flatnonzero(mesh.element_side > 0)
     back = np.flatnonzero(mesh.element_side < 0)
@@ -262,7 +263,7 @@ class DirectionalBundles:
         self.counters = Counters()
         self.seconds_in_embree = 0.0
         self.accelerator = EmbreeAccelerator(geometry, workers=1)
-        elements, self._front, self._other = _element_geometry(mesh)
+        elements, self._front, self._other = element_geometry(mesh)
         self._tracer = EmbreeAccelerator(elements)
         floor = settings.floor
         self._floor = 0.1 * settings.error / max(mesh.patch_count, 1) if floor is None else floor

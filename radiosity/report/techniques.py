@@ -430,27 +430,16 @@ class ViewFactors(Problem):
 
     def _rays(self) -> Technique:
         self._no_panes("rays")
-        from workbench.accel.embree import EmbreeAccelerator
-        from workbench.geometry.polygons import plane_basis
-        from workbench.sampling.sequences import owen_sobol
-        from workbench.sampling.warp import square_to_cosine_hemisphere
+        from radiosity.form_factors.hemisphere_rays import RANDOMISATIONS, HemisphereRays
 
-        tracer = EmbreeAccelerator(self.geometry)
-        frames = np.stack([np.stack([*plane_basis(n), n]) for n in self.geometry.polygon_normal])
+        mesh = self._mesh
+        source = HemisphereRays(mesh, mesh.element_polygon)
 
         def ask(value: float, seed: int) -> Answer:
-            before = dict(tracer.counters)
-            points, normals, owner, weight = self._sample_points(int(value), seed)
-            unit = owen_sobol(1, len(points), seed)[0]
-            toward = np.einsum("ni,nij->nj", square_to_cosine_hemisphere(unit), frames[owner])
-            found = tracer.closest_hit(points + tracer.offset * normals, toward)
-            hit = np.flatnonzero(found.polygon >= 0)
-            met = found.polygon[hit]
-            hit = hit[np.einsum("ij,ij->i", self.geometry.polygon_normal[met], toward[hit]) < 0.0]
-            total = np.zeros((self.geometry.polygon_count,) * 2)
-            np.add.at(total, (owner[hit], found.polygon[hit]), weight[hit])
-            counters = {name: count - before.get(name, 0) for name, count in tracer.counters.items()}
-            return Answer(total, counters)
+            counters = Counters()
+            rays = max(1, round(value / RANDOMISATIONS))
+            hits, _ = source.hits(rays, 0, seed, map, counters)
+            return Answer(hits / (rays * RANDOMISATIONS), dict(counters))
 
         return Technique("rays", "rays a polygon", (256, 1024, 4096, 16384, 65536, 262144), ask)
 

@@ -1,0 +1,185 @@
+"""View factors by rays from the rows: closed forms, reciprocity, two sides, open scenes, and when they are taken."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radiosity_scenes import UNIT, polygon_scene
+from view_factor_scenes import closed_room
+
+import radiosity
+from radiosity.form_factors import matrix
+from workbench.scene.library import box_surface, diffuse
+from workbench.scene.model import Scene, Surface
+
+
+def errors_of(found):
+    return found.standard_error if not found.sparse else found.standard_error.toarray()
+
+
+@pytest.fixture
+def by_rays(monkeypatch):
+    """Rays however small the scene."""
+    monkeypatch.setattr(matrix, "PAIR_SECONDS", np.inf)
+
+    def ask(scene, **options):
+        found = radiosity.view_factors(scene, **options)
+        assert found.record.results["method"] == "hemisphere rays" and found.record.counters["rays"] > 0
+        return found
+
+    return ask
+
+
+def grid(name, corner, along, across, n, material=None):
+    """A parallelogram in n x n squares."""
+    corner, along, across = (np.asarray(v, dtype=float) for v in (corner, along, across))
+    step = np.arange(n + 1) / n
+    points = corner + step[:, None, None] * along + step[None, :, None] * across
+    k = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    rings = np.stack([k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]], axis=-1).reshape(-1, 4)
+    return Surface.from_mesh(name, material or diffuse(name, 0.5), points.reshape(-1, 3), rings)
+
+
+FACING = (
+    grid("low", [0, 0, 0], [1, 0, 0], [0, 1, 0], 50),
+    grid("high", [0, 0, 1], [0, 1, 0], [1, 0, 0], 50),
+)
+HOWELL_C11 = 0.19982489569838746
+
+
+def test_many_polygons_by_surface_get_rays_and_their_closed_form():
+    z = []
+    for seed in range(12):
+        found = radiosity.view_factors(Scene("facing", FACING, bands=1), by="surface", error=0.02, seed=seed, workers=1)
+        assert found.record.results["method"] == "hemisphere rays"
+        predicted = found.record.results["predicted_seconds"]
+        assert predicted["hemisphere rays"] < predicted["pairs"]
+        assert found.record.errors["stated_row_error"] <= 0.02
+        assert found.closure_correction == 0 and found.reciprocity < 1e-14
+        assert (np.diag(found.dense()) == 0).all() and (np.diag(errors_of(found)) == 0).all()
+        z.append((found.dense()[0, 1] - HOWELL_C11) / errors_of(found)[0, 1])
+    assert np.abs(z).max() < 4
+    # Neither biased nor stated far too large or too small: 12 draws.
+    assert abs(np.mean(z)) < 4 / np.sqrt(12) and 0.3 < np.sqrt(np.mean(np.square(z))) < 2
+
+
+def test_small_scenes_and_rows_as_many_as_polygons_keep_their_pairs():
+    small = radiosity.view_factors(
+        polygon_scene(FACING[0].face(0)[0] * 50, [[0, 0, 1], [0, 1, 1], [1, 1, 1]]), error=0.1
+    )
+    assert small.record.results["method"] == "pairs"
+    room = closed_room(0.8)
+    for by, error in (("patch", 0.1), ("patch", 1e-3), ("surface", 1e-3)):
+        mesh = matrix.Geometry.from_scene(room)
+        rows = mesh.polygon_count if by == "patch" else len(room.surfaces)
+        assert matrix._choice(matrix._Elements.of_polygons(mesh), mesh, rows, error)[0] == "pairs"
+
+
+def test_more_rays_for_a_smaller_error(by_rays):
+    room = closed_room(2.0)
+    rays = []
+    for error in (0.1, 0.03, 0.01):
+        found = by_rays(room, by="surface", error=error, workers=2)
+        assert found.record.errors["stated_row_error"] <= error
+        rays.append(found.record.results["rays_a_row"])
+    assert rays[0] < rays[1] < rays[2]
+
+
+@pytest.mark.parametrize("by", ["surface", "patch"])
+def test_a_closed_room_with_obstruction_against_pairs(by_rays, monkeypatch, by):
+    room = closed_room(2.0)
+    z = []
+    for seed in range(3):
+        found = by_rays(room, by=by, error=0.03, seed=seed, workers=2)
+        factor = found.dense()
+        exchange = found.areas[:, None] * factor
+        assert np.abs(exchange - exchange.T).max() <= 1e-14 * exchange.max()
+        assert np.abs(factor.sum(axis=1) - 1).max() < 1e-9 and found.closure_correction > 0
+        assert np.abs(found.row_sums - 1).max() < 0.05
+        with monkeypatch.context() as plain:
+            plain.setattr(matrix, "PAIR_SECONDS", 0.0)
+            exact = radiosity.view_factors(room, by=by, error=1e-4, workers=2)
+        assert exact.record.results["method"] == "pairs"
+        off = factor - exact.dense()
+        assert np.abs(off).sum(axis=1).mean() < 0.03
+        doubt = np.hypot(errors_of(found), errors_of(exact))
+        assert (off[doubt == 0] == 0).all()
+        # Pairs of rows that cannot face each other have neither value nor error.
+        assert (factor[errors_of(found) == 0] == 0).all()
+        z.append((off / np.where(doubt > 0, doubt, 1.0))[exact.dense() > 0.01])
+    z = np.concatenate(z)
+    assert 0.3 < np.sqrt((z**2).mean()) < 1.5 and np.abs(z).max() < 5
+
+
+def test_threads_change_nothing_and_seeds_do(by_rays):
+    room = closed_room(2.0)
+    one, two, other = (by_rays(room, error=0.1, workers=w, seed=s) for w, s in ((1, 0), (2, 0), (2, 1)))
+    assert (one.dense() == two.dense()).all() and dict(one.record.counters) == dict(two.record.counters)
+    assert (one.dense() != other.dense()).any()
+
+
+def test_both_sides_of_a_sheet_and_a_black_back(by_rays):
+    # Between two squares a sheet that covers both: its sides see one each, and the squares do not see each other.
+    material = diffuse("sheet", 0.5)
+    two = type(material)(**{**material.__dict__, "two_sided": True})
+    box = [grid("low", [0, 0, 0], [1, 0, 0], [0, 1, 0], 3), grid("high", [0, 0, 2], [0, 1, 0], [1, 0, 0], 3)]
+    for sheet_material, back in ((two, True), (material, False)):
+        sheet = grid("sheet", [-9, -9, 1], [19, 0, 0], [0, 19, 0], 4, sheet_material)
+        found = by_rays(Scene("sheet", (*box, sheet), bands=1), by="surface", error=0.03)
+        low, high, up = (found.names.index(name) for name in ("low", "high", "sheet"))
+        factor, error = found.dense(), errors_of(found)
+        assert factor[low, high] == 0 and factor[low, up] == 0 and factor[high, low] == 0
+        assert abs(factor[high, up] - 1) < 0.02
+        if back:
+            down = found.names.index("sheet (back)")
+            assert factor[low, down] == pytest.approx(factor[high, up], abs=0.02)
+            assert factor[up, down] == factor[down, up] == error[up, down] == 0
+        else:
+            assert factor[low].sum() == 0  # the back is black
+
+
+def test_what_no_ray_met_keeps_the_doubt_of_one_hit(by_rays):
+    # A speck of a millionth of the area of the floor below it; rays from it find the floor, but not each speck another.
+    speck = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0]], dtype=float) * 1e-3
+    low = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    found = by_rays(polygon_scene(low, speck + [0.2, 0.2, 0.5], low[::-1] * [1, 1, 0] + [0, 0, 5]), error=0.05)
+    factor, error = found.dense(), errors_of(found)
+    rays = found.record.results["rays_a_row"]
+    assert factor[1, 0] > 0.3
+    # From above the speck is a back; it faces the floor only, and nothing on the diagonal is possible.
+    assert (np.diag(error) == 0).all() and error[1, 2] == 0
+    hit = 1.0 / (rays * (1 / found.areas[0] + 1 / found.areas[1]))
+    assert error[0, 1] * found.areas[0] >= hit * (1 - 1e-6)
+
+
+def test_covered_floor_keeps_what_it_sees_by_rays(by_rays):
+    room = box_surface("room", diffuse("wall", 0.5), *UNIT, inward=True)
+    box = box_surface("box", diffuse("box", 0.5), [0.25, 0.25, 0], [0.75, 0.75, 0.5], omit=["-z"])
+    found = by_rays(Scene("covered", (room, box), bands=1, closed=True), error=0.02)
+    assert found.record.results["covered_rows"] == 1
+    sums = found.dense().sum(axis=1)
+    assert sums.min() == pytest.approx(0.75, abs=0.01) and np.abs(np.sort(sums)[1:] - 1).max() < 1e-6
+
+
+def test_divided_polygons_and_sparse(by_rays, monkeypatch):
+    # Rays land on elements; back to back rooms see nothing of each other, so that most entries are impossible.
+    monkeypatch.setattr(matrix, "SPARSE_ENTRY", 0)
+    scene = Scene(
+        "facing",
+        (grid("low", [0, 0, 0], [1, 0, 0], [0, 1, 0], 1), grid("high", [0, 0, 1], [0, 1, 0], [1, 0, 0], 1)),
+        bands=1,
+    )
+    found = by_rays(scene, max_edge=0.5, error=0.05)
+    assert found.sparse and len(found.names) > 2
+    low = np.array([name.startswith("low") for name in found.names])
+    exchange = found.areas[:, None] * found.dense()
+    assert exchange[np.ix_(low, ~low)].sum() == pytest.approx(HOWELL_C11, abs=0.01)
+    assert exchange[np.ix_(low, low)].sum() == 0 and found.reciprocity < 1e-14
+
+
+def test_panes_keep_their_pairs(by_rays):
+    pane = diffuse("pane", 0.1)
+    pane = type(pane)(**{**pane.__dict__, "transmittance": np.full_like(pane.reflectance, 0.5)})
+    sheet = grid("pane", [0, 0, 0.5], [1, 0, 0], [0, 1, 0], 1, pane)
+    found = radiosity.view_factors(Scene("pane", (FACING[0], sheet), bands=1), by="surface", error=0.1)
+    assert found.record.results["method"] == "pairs"
