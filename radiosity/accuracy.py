@@ -62,6 +62,8 @@ MOST_DOUBT = 0.35
 """Share of the squared difference that may be sampling."""
 ORDER = 0.9
 """Power of the number of elements with which the meshing error falls, until it has been seen to."""
+SEEN_TARGET = 0.003
+"""Asked error up to which an order that was not seen is taken for a standard deviation less."""
 ORDERS = (0.5, 1.5)
 """Orders that are believed when seen."""
 ORDER_SPREAD, SEEN_SPREAD, SEEN_ELEMENTS = 0.25, 0.3, 100
@@ -248,7 +250,8 @@ def _watched(progress: Progress | None, run: _Run, message: str, stoppable: bool
 def _like(solution: Solution) -> float:
     """How many elements alike leave as large an error as those of a solution."""
     mesh = solution.mesh
-    return like_elements(mesh.element_area, (mesh.reflectance * solution.element_irradiance).mean(axis=1))
+    like = like_elements(mesh.element_area, (mesh.reflectance * solution.element_irradiance).mean(axis=1))
+    return like or float(mesh.element_count)  # nothing is reflected
 
 
 def _order(levels: list[dict[str, Any]]) -> float:
@@ -699,15 +702,19 @@ def _refine(
         like = levels.like(solution)
         run.levels.append({"elements": n, "like": like, "coarse_like": coarse, "difference": difference})
         order = _order(run.levels)
+        if len(run.levels) == 1 and run.target <= SEEN_TARGET:
+            order = ORDER - ORDER_SPREAD
         if method == "hierarchical":
             order = min(order, LINK_ORDER)
         meshing = math.inf
-        if difference is not None:
+        if difference == 0.0:
+            meshing = 0.0
+        elif difference is not None:
             growth = like / coarse
             if method == "hierarchical":
                 # Links are as coarse as the elements are few, however alike these are.
                 growth = min(growth, n / run.levels[-2]["elements"])
-            meshing = difference / (growth**order - 1.0) if difference > 0 else 0.0
+            meshing = difference / (max(growth, LEAST_GROWTH) ** order - 1.0)
         estimate = _parts(solution, meshing, run.scale)
         now = time.perf_counter()
         run.spent["error estimate"] = run.spent.get("error estimate", 0.0) + now - start
