@@ -20,6 +20,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numba.core import event
 from numpy.typing import NDArray
 
 from radiosity.accuracy import solve, surface_points
@@ -115,33 +116,36 @@ class _Stopped(BaseException):
     """Raised where the time of a run is up; as Ctrl-C, no handler of errors takes it."""
 
 
-@contextmanager
-def _at_most(seconds: float) -> Iterator[None]:
-    """Stop the block once it took that much processor time; in a thread other than the main one, never."""
-    if not math.isfinite(seconds) or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    over = False
+class _Compiling(event.Listener):
+    """Seconds in which kernels are compiled, on the clock and of the processor: the first run on a machine has many."""
 
-    def stop(*_: object) -> None:
-        if not over:
-            raise _Stopped
+    def __init__(self) -> None:
+        self.wall = self.processor = 0.0
+        self._depth = 0
+        self._since = (0.0, 0.0)
 
-    before = signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, max(seconds, 1e-3))
-    try:
-        yield
-    finally:
-        over = True
-        signal.setitimer(signal.ITIMER_PROF, 0.0)
-        signal.signal(signal.SIGPROF, before)
+    def on_start(self, event: event.Event) -> None:
+        if self._depth == 0:
+            self._since = time.perf_counter(), time.process_time()
+        self._depth += 1
+
+    def on_end(self, event: event.Event) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self.wall += time.perf_counter() - self._since[0]
+            self.processor += time.process_time() - self._since[1]
+
+    def so_far(self) -> float:
+        """Processor seconds, those of a kernel under way with them."""
+        return self.processor + (time.process_time() - self._since[1] if self._depth else 0.0)
 
 
 class _Purse:
     """Processor seconds that are left."""
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds: float, whole: _Purse | None = None) -> None:
         self.end = time.process_time() + seconds
+        self.whole = whole
 
     def left(self, share: float = 1.0) -> float:
         """A share of what is left. [s]"""
@@ -149,7 +153,46 @@ class _Purse:
 
     def part(self, share: float) -> _Purse:
         """A purse of a share of what is left."""
-        return _Purse(self.left(share))
+        return _Purse(self.left(share), self)
+
+    def give_back(self, seconds: float) -> None:
+        """Count so many seconds that are past as not spent, here and in the purse that this one is part of."""
+        self.end += seconds
+        if self.whole is not None:
+            self.whole.give_back(seconds)
+
+
+@contextmanager
+def _at_most(seconds: float, purse: _Purse) -> Iterator[_Compiling]:
+    """Stop the block once it took that much processor time, compiling left out: the purse gets that back.
+
+    In a thread other than the main one nothing is stopped.
+    """
+    compiling = _Compiling()
+    limited = math.isfinite(seconds) and threading.current_thread() is threading.main_thread()
+    end = time.process_time() + seconds
+    over = False
+
+    def stop(*_: object) -> None:
+        if over:
+            return
+        left = end + compiling.so_far() - time.process_time()
+        if left <= 0.0:
+            raise _Stopped
+        signal.setitimer(signal.ITIMER_PROF, max(left, 1e-3))
+
+    with event.install_listener("numba:compile", compiling):
+        if limited:
+            before = signal.signal(signal.SIGPROF, stop)
+            signal.setitimer(signal.ITIMER_PROF, max(seconds, 1e-3))
+        try:
+            yield compiling
+        finally:
+            over = True
+            if limited:
+                signal.setitimer(signal.ITIMER_PROF, 0.0)
+                signal.signal(signal.SIGPROF, before)
+            purse.give_back(compiling.processor)
 
 
 def _ablate(
@@ -161,11 +204,12 @@ def _ablate(
     def timed(name: str, most: float = math.inf) -> tuple[float, float, _Outcome | None]:
         start, used = time.perf_counter(), time.process_time()
         try:
-            with _at_most(most):
+            with _at_most(most, purse) as compiling:
                 answer: _Outcome | None = tasks[name]()
         except _Stopped:
             answer = None
-        return time.perf_counter() - start, time.process_time() - used, answer
+        wall, processor = time.perf_counter() - start, time.process_time() - used
+        return wall - compiling.wall, processor - compiling.processor, answer
 
     first, cost, answer = timed(base)
     assert answer is not None
@@ -361,7 +405,7 @@ def _better(found: Explanation, part: str, tasks: Sequence[Callable[[], _Outcome
     """The first of some answers, best first, that takes less than a third of the time."""
     for task in tasks:
         try:
-            with _at_most(purse.left(0.35)):
+            with _at_most(purse.left(0.35), purse):
                 return task().values
         except (_Stopped, WorkbenchError):
             continue
@@ -393,7 +437,7 @@ def _shadows(
     exact = None
     while exact is None:
         try:
-            with _at_most(purse.left(0.3)):
+            with _at_most(purse.left(0.3), purse):
                 exact = ask("exact").irradiance
         except _Stopped:
             if len(points) <= POINTS // 16:
@@ -423,7 +467,7 @@ def _shadows(
     for method in ("rays", "shaft"):
         samples = 4
         try:
-            with _at_most(purse.left(0.2)):
+            with _at_most(purse.left(0.2), purse):
                 while samples < MOST_SAMPLES and off(ask(method, samples)) > goal:
                     samples *= 2
         except _Stopped:
@@ -510,7 +554,7 @@ def _meshes(
 
     elements = count
     try:
-        with _at_most(purse.left(0.3)):
+        with _at_most(purse.left(0.3), purse):
             goal = max(error, off(gathered().values)) if better is not None else math.inf
             for _ in range(MOST_DOUBLINGS):
                 if off(read(elements).values) <= goal:

@@ -8,10 +8,20 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from matplotlib.figure import Figure
+from numba.core import event
 
 from radiosity.cli import main
 from radiosity.report.cost_model import TABLE, CostModel, fit, read_table, write_table
-from radiosity.report.explanation import Explanation, _ablate, _Outcome, _Purse, draw_ablations, explain
+from radiosity.report.explanation import (
+    Explanation,
+    _ablate,
+    _at_most,
+    _Outcome,
+    _Purse,
+    _Stopped,
+    draw_ablations,
+    explain,
+)
 from radiosity.report.speed_accuracy import Run
 from workbench.errors import InputError, OptionError
 from workbench.scene.load import load
@@ -120,6 +130,21 @@ def test_dear_work_is_stopped_and_told():
     empty = Explanation(None)
     _ablate(empty, "mesh", words, "base", tasks, 3, lambda values: 0.0, _Purse(0.0))
     assert not empty.ablations and len(empty.facts) == 4 and "no time was left" in empty.facts[0]
+
+
+def test_compiling_does_not_count():
+    """0.3 s of compiling do not end work that may take 0.1 s, and are not taken from the purse."""
+    purse = _Purse(1.0)
+    part = purse.part(0.5)
+    with _at_most(0.1, part) as compiling, event.trigger_event("numba:compile"):
+        end = time.process_time() + 0.3
+        while time.process_time() < end:
+            sum(range(1000))
+    assert compiling.processor >= 0.3 and part.left() > 0.4 and purse.left() > 0.9
+    with pytest.raises(_Stopped), _at_most(0.01, part):
+        while part.left() > 0.0:
+            sum(range(1000))
+    assert part.left() > 0.3
 
 
 def test_a_solve_by_links_is_explained():
