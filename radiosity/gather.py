@@ -157,6 +157,11 @@ class GatherOptions:
         return int(np.clip(2 ** round(math.log2(16 * 0.02 / self.error)), 4, 64))
 
     @property
+    def fuzzy_places(self) -> int:
+        """Rays from the eye, at first, in a pixel that shows an edge or a speck of a fuzzy reflection."""
+        return int(np.clip(2 ** round(math.log2(1.28 / self.error)), 16, 512))
+
+    @property
     def check_places(self) -> int:
         """Rays from the eye in a pixel that is drawn again to tell the error."""
         return int(np.clip(2 ** round(math.log2(2.56 / self.error)), 32, 1024))
@@ -202,7 +207,8 @@ class _Fragments:
 class _Seen:
     """What rays from the eye met: radiance (n, bands) that needs no gather and the part of it without fuzzy
     reflections, a mark (n,) by which rays that saw the same sheets are alike, fragments, of which ``ray`` tells
-    the ray, in the order of the rays, and each ray's ``polygon`` (n,) where it is known."""
+    the ray, in the order of the rays, each ray's ``polygon`` (n,) where it is known, and whether a fuzzy reflection
+    is the first thing that it met (n,)."""
 
     radiance: FloatArray
     steady: FloatArray
@@ -210,6 +216,7 @@ class _Seen:
     fragments: _Fragments
     ray: IntArray
     polygon: IntArray
+    fuzzy: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -384,7 +391,8 @@ class PictureGatherer:
         keep = np.arange(len(ends.ray))
         sheet = 2 * self._sheets[ends.polygon] + ~ends.front
         met = self.gatherer.shader.tracer.closest_hit(rays.eye, along).polygon
-        mirror = np.where(met >= 0, self.geometry.polygon_surface[met], -1)[ends.ray]
+        first = np.where(met >= 0, self.geometry.polygon_surface[met], -1)
+        mirror = first[ends.ray]
         read = (ends.depth > 0) & self._fuzzy[mirror]
         if read.any() and self.options.indirect:
             # Many rays of a lobe, each of little weight: they read the solution, as bundles do.
@@ -412,7 +420,7 @@ class PictureGatherer:
         order = np.argsort(ends.ray, kind="stable")
         return _Seen(
             radiance, steady, mark.astype(np.int64), fragments.take(order), ends.ray[order],
-            np.full(len(x), NO_POLYGON, dtype=np.int64),
+            np.full(len(x), NO_POLYGON, dtype=np.int64), self._fuzzy[first],
         )  # fmt: skip
 
     def _look_plainly(
@@ -478,7 +486,7 @@ class PictureGatherer:
             pixel[rows], sheet[:many], polygon[rows], x[rows], y[rows], points[rows], shading[rows], footprint[:many],
             gain[:many],
         )  # fmt: skip
-        return _Seen(radiance, radiance, mark, fragments, ray, polygon)
+        return _Seen(radiance, radiance, mark, fragments, ray, polygon, np.zeros(n, dtype=bool))
 
 
 def _sheets(geometry: Geometry) -> IntArray:
@@ -818,6 +826,8 @@ class _Tile:
         # Corners stand off whole numbers by a hair: edges of rooms like to lie on them.
         down, across = np.divmod(np.arange((self.width + 1) * (self.height + 1)), self.width + 1)
         corner = self._look(across + 1e-4, down + 1e-4, np.arange(len(across)), self._keys(across, down, 0))
+        lobes = corner.fuzzy.reshape(self.height + 1, self.width + 1)
+        self.fuzzy = (lobes[:-1, :-1] | lobes[:-1, 1:] | lobes[1:, :-1] | lobes[1:, 1:]).ravel()
         same, varies = np.empty(shape, dtype=bool), np.empty(shape)
         kernels.alike(corner.mark, corner.steady, self.width, self.height, STEP, same, varies)
         pixel = np.flatnonzero(same)
@@ -863,10 +873,12 @@ class _Tile:
         seen, moments = np.zeros((len(pixels), bands)), np.zeros((len(pixels), 5))
         moments[:, 3], moments[:, 4] = math.inf, corners
         parts: list[tuple[_Fragments, IntArray, FloatArray, NDArray[np.bool_]]] = []
-        target = np.full(
-            len(pixels),
-            self.options.check_places if allowed is None else FIRST_PLACES[self.options.error < TRUSTED],
-        )
+        if allowed is None:
+            target = np.full(len(pixels), self.options.check_places)
+        else:
+            # Few rays of few lobes either miss a lamp or make a speck of it.
+            least_places = FIRST_PLACES[self.options.error < TRUSTED]
+            target = np.where(self.fuzzy[pixels], self.options.fuzzy_places, least_places)
         for _ in range(INSIDE_ROUNDS if allowed is not None else 1):
             self._cast(pixels, shadow, count, target, seen, moments, parts)
             count = np.maximum(count, target)

@@ -335,3 +335,15 @@ def test_pixels_with_edges_are_as_right_as_was_asked(error):
         off.append(square[lit] / norm[lit])
         assert picture.samples["camera"].mean() < 64
     assert np.sqrt(np.mean(off)) < error
+
+
+@pytest.mark.parametrize("exponent", [60.0, np.inf])
+def test_pixels_that_are_cut_begin_with_more_rays_where_reflections_are_fuzzy(exponent):
+    gatherer = PictureGatherer(solved(mirror_room(exponent)), GatherOptions(error=0.05), workers=1)
+    view = camera((1.5, 0.8, 1.0), (1.3, 1.0, 0), up=(0, 1, 0), fov=90, width=12, height=12)
+    tile = gather._Tile(Picture(gatherer, view), 0, 0, 12, 12)
+    tile.look()
+    assert tile.fuzzy.any() == np.isfinite(exponent)
+    cast = tile.samples["camera"]
+    cut = (cast > 2) & (tile.fuzzy | np.isinf(exponent))  # more than a corner and the middle
+    assert cut.any() and (cast[cut].min() > 32) == np.isfinite(exponent)
