@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from radiosity.stopping import INTERRUPTED
 from workbench.errors import InputError, OptionError
 
 if TYPE_CHECKING:
@@ -157,6 +158,9 @@ def _solution(
             else:
                 tolerance = min(0.01, UNSHOT_SHARE * error)
                 solution = radiosity.solve(scene, elements=elements, tolerance=tolerance, workers=workers, seed=seed)
+        if solution.stopped == "interrupted":  # its error is not known
+            click.echo("radiosity: stopped by Ctrl-C during the solve; nothing was written", err=True)
+            raise SystemExit(INTERRUPTED)
         record.counters.merge(solution.record.counters)
         record.choices["solution"] = f"solved with {solution.mesh.element_count} elements"
     record.errors["solution"] = solution.record.errors

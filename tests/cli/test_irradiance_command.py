@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import math
+import signal
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import radiosity
 from radiosity import cli
 from radiosity.points_file import read_sensor_points
 from workbench.errors import InputError
@@ -139,6 +141,24 @@ def test_a_failed_write_leaves_the_old_table(run, tmp_path, monkeypatch):
     assert result.exit_code == 130
     assert (tmp_path / "out.csv").read_text() == "old\n"
     assert not [path for path in tmp_path.iterdir() if ".part" in path.name]
+
+
+@pytest.mark.parametrize("options", [["--error", "0.002"], ["--elements", "64"]])
+def test_ctrl_c_in_the_solve_ends_in_one_line_and_writes_nothing(run, tmp_path, monkeypatch, options):
+    solve, stopped = radiosity.solve, []
+
+    def interrupting(scene, **more):
+        def report(event):
+            stopped.append(event)
+            signal.raise_signal(signal.SIGINT)
+
+        return solve(scene, progress=report, **more)
+
+    monkeypatch.setattr(radiosity, "solve", interrupting)
+    result = run("scene.toml", "--points", "points.csv", "-o", "out.csv", "--json", "run.json", *options)
+    assert stopped and result.exit_code == 130
+    assert result.output == "radiosity: stopped by Ctrl-C during the solve; nothing was written\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["points.csv", "scene.toml"]
 
 
 def test_the_reader_takes_what_tools_write(tmp_path):
