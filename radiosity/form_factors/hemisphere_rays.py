@@ -229,8 +229,8 @@ def ray_exchanges(
 
     The hits of both directions of a pair are added up: by reciprocity they have the variances A_i S / N and A_j S / N
     of an exchange area S, whose inverses as weights give the hits of both over N / A_i + N / A_j.  The weights
-    don't depend on what was hit, so the mean is not biased.  No error is less than that of one hit, also of a pair that
-    none has met: three times that is its bound by the rule of three (J. A. Hanley and A. Lippman-Hand, JAMA 249, 1983).
+    don't depend on what was hit, so the mean is not biased.  No error is less than that of one hit, and that of a
+    pair that no ray has met is three hits, by the rule of three (J. A. Hanley and A. Lippman-Hand, JAMA 249, 1983).
     """
     n = len(areas)
     facing = source.facing()
@@ -246,7 +246,8 @@ def ray_exchanges(
         turn += 1
         each_hit = 1.0 / (done * RANDOMISATIONS * np.where(own, inverse[:, None], inverse[:, None] + inverse))
         both = np.where(own, hits, hits + hits.T)
-        spread = np.sqrt(np.maximum(np.where(own, variance, variance + variance.T), 1.0)) * each_hit * facing
+        least = np.where(both > 0.0, 1.0, 9.0)  # the square of one hit, and of three
+        spread = np.sqrt(np.maximum(np.where(own, variance, variance + variance.T), least)) * each_hit * facing
         stated = float((spread.sum(axis=1) * inverse).mean())
         if progress is not None:
             progress(min((AIM * error / stated) ** 2, 1.0))

@@ -269,6 +269,8 @@ def _shadow_entries() -> list[Failure]:
 FACTOR_TECHNIQUES = ("view factors", "bundle", "bundle to 1e-6", "hemicube", "hemisphere rays")
 FEW_POLYGONS = 8
 """Scenes of more are asked only of what finds the one form factor that is judged, not all pairs."""
+NO_HIT = 7.0
+"""n rays without a hit say that F is below this / n; of a thousand such words one is wrong, exp(-7)."""
 OPPOSITE = 0.19982489569838746
 """Unit squares opposite each other at distance 1 (Howell C-11)."""
 
@@ -302,8 +304,8 @@ def _factor(scene: Scene, technique: str) -> tuple[float, float]:
     ask = problem_for("viewfactors", scene, workers=1).technique("hemicube" if technique == "hemicube" else "rays").ask
     count = 64 if technique == "hemicube" else 16384
     runs = [float(ask(count, seed).values[0, 1]) for seed in range(4)]
-    # A run without a hit says no more than that F is below about 3 / n; a hemicube's pixels are this coarse.
-    least = 5.1e-4 if technique == "hemicube" else 3.0 / (4 * count) / STATED
+    # A hemicube's pixels are this coarse.
+    least = 5.1e-4 if technique == "hemicube" else NO_HIT / (4 * count) / STATED
     return float(np.mean(runs)), float(np.std(runs, ddof=1)) / 2.0 + least
 
 
@@ -313,7 +315,7 @@ def _rival_factor(scene: Scene, rival: str) -> tuple[float, float]:
         fine, coarse = (float(opened.view_factors(samples=n)[0, 1]) for n in (64, 16))
         return fine, abs(fine - coarse) / STATED
     value, doubt = spread_of(lambda seed: float(opened.view_factors(samples=16384, seed=seed)[0, 1]))
-    return value, doubt + 3.0 / (4 * 16384) / STATED
+    return value, doubt + NO_HIT / (4 * 16384) / STATED
 
 
 def _pair(

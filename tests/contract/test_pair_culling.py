@@ -15,7 +15,7 @@ from view_factor_scenes import closed_room
 import radiosity
 from radiosity.form_factors import matrix
 from radiosity.form_factors.bundle import LinkSettings
-from radiosity.form_factors.directional import DirectionalBundles
+from radiosity.form_factors.directional import RAYS_A_BUNDLE, DirectionalBundles
 from radiosity.form_factors.matrix import _Care, _Elements, _Engine
 from radiosity.patches import build_mesh
 from workbench.geometry.coplanar import join_coplanar
@@ -108,8 +108,8 @@ def test_matrices_agree_with_rays(seed):
     bundles.close()
     stated = found.standard_error if not found.sparse else found.standard_error.toarray()
     off = np.abs(columns.factor.T - found.dense())
-    # The scatter of few hits is no standard error: theirs is that of counts.
-    weight = mesh.patch_area[None, :] / mesh.element_area[:, None] / (400 * mesh.element_count)
+    # The scatter of few hits is no standard error: theirs is that of counts, of bundles that hit or miss together.
+    weight = RAYS_A_BUNDLE * mesh.patch_area[None, :] / mesh.element_area[:, None] / (400 * mesh.element_count)
     noise = np.maximum(columns.spread.T, np.sqrt(found.dense() * weight) + weight)
     allowed = 5 * noise + 5 * stated
     assert (off <= allowed).all(), np.argwhere(off > allowed)[:3]

@@ -138,7 +138,7 @@ def test_both_sides_of_a_sheet_and_a_black_back(by_rays):
             assert factor[low].sum() == 0  # the back is black
 
 
-def test_what_no_ray_met_keeps_the_doubt_of_one_hit(by_rays):
+def test_what_no_ray_met_keeps_the_doubt_of_hits(by_rays):
     # A speck of a millionth of the area of the floor below it; rays from it find the floor, but not each speck another.
     speck = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0]], dtype=float) * 1e-3
     low = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
