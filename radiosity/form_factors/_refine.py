@@ -20,6 +20,7 @@ from numba import njit
 from radiosity.form_factors._contour import contour_integral_in
 from radiosity.form_factors._pairs import _PLAIN, CLEARS, HIDES, _axis_verdict, _heights, crossings, seen_share, verdict
 from radiosity.form_factors._ray_shares import MOST_RAYS
+from radiosity.form_factors._sampling import RADON_POINTS, RADON_WEIGHTS
 from radiosity.form_factors.analytic import _clip_pair
 from workbench.culling.tally import CLOSED, COMPLEX, DARK, SHAFT_CULL, SHAFT_TEST
 from workbench.geometry.lambert import lambert_piece
@@ -57,19 +58,9 @@ SPARE = 2 * CORNERS * ROWS
 EVEN = 0.1
 """Part of a cell's height that a cut along an event must leave on either side; else it is halved."""
 
-_S15 = math.sqrt(15.0)
-_A, _B = (6.0 - _S15) / 21.0, (6.0 + _S15) / 21.0
-_POINTS = np.array(
-    [
-        [1 / 3, 1 / 3, 1 / 3],
-        [1 - 2 * _A, _A, _A], [_A, 1 - 2 * _A, _A], [_A, _A, 1 - 2 * _A],
-        [1 - 2 * _B, _B, _B], [_B, 1 - 2 * _B, _B], [_B, _B, 1 - 2 * _B],
-    ]
-)  # fmt: skip
-_HIGH = np.array([9 / 40, *[(155 - _S15) / 1200] * 3, *[(155 + _S15) / 1200] * 3])
-"""Radon's rule of seven points, exact to the fifth degree."""
+_A = RADON_POINTS[1, 1]
 _LOW = np.array([1.0 - 0.25 / (1 - 3 * _A) ** 2, *[0.25 / (1 - 3 * _A) ** 2 / 3] * 3, 0.0, 0.0, 0.0])
-"""The rule of four of its points that is exact to the second degree."""
+"""The rule of four of Radon's points that is exact to the second degree."""
 
 
 def cell_workspace(occluders, room):
@@ -346,7 +337,7 @@ def _clear_value(cells, row, numbers, ns, allowed, contour, tally):
             for p in range(7):
                 x, y, z = _part_point(cells, s0, part, p)
                 value = max(lambert_piece(x, y, z, ns[0], ns[1], ns[2], cells, t0, t0 + size_t), 0.0)
-                high += _HIGH[p] * value
+                high += RADON_WEIGHTS[p] * value
                 low += _LOW[p] * value
             total += area * high
             off += area * abs(high - low) * (sr / gap)
@@ -373,7 +364,7 @@ def _part_area(cells, s0, part):
 def _part_point(cells, s0, part, p):
     """A point of the rule on a triangle of a polygon's fan."""
     b, c = s0 + part, s0 + part + 1
-    u, v = _POINTS[p, 1], _POINTS[p, 2]
+    u, v = RADON_POINTS[p, 1], RADON_POINTS[p, 2]
     w = 1.0 - u - v
     return (
         w * cells[s0, 0] + u * cells[b, 0] + v * cells[c, 0],
@@ -417,7 +408,7 @@ def _cell_value(
                 least, most = min(least, share / whole), max(most, share / whole)
             if close:
                 share = max(whole - share, 0.0)
-            high += _HIGH[p] * share
+            high += RADON_WEIGHTS[p] * share
             low += _LOW[p] * share
         total += area * high
         off += area * abs(high - low)

@@ -7,6 +7,18 @@ import math
 import numpy as np
 from numba import njit
 
+_S15 = math.sqrt(15.0)
+_A, _B = (6.0 - _S15) / 21.0, (6.0 + _S15) / 21.0
+RADON_POINTS = np.array(
+    [
+        [1 / 3, 1 / 3, 1 / 3],
+        [1 - 2 * _A, _A, _A], [_A, 1 - 2 * _A, _A], [_A, _A, 1 - 2 * _A],
+        [1 - 2 * _B, _B, _B], [_B, 1 - 2 * _B, _B], [_B, _B, 1 - 2 * _B],
+    ]
+)  # fmt: skip
+RADON_WEIGHTS = np.array([9 / 40, *[(155 - _S15) / 1200] * 3, *[(155 + _S15) / 1200] * 3])
+"""Radon's rule of seven points, exact to the fifth degree."""
+
 
 @njit(nogil=True, cache=True, inline="always")
 def stream(a, b, seed):

@@ -18,6 +18,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from radiosity.form_factors import _pairs
+from radiosity.form_factors._sampling import RADON_POINTS, RADON_WEIGHTS
 from radiosity.form_factors.analytic import _as_pieces, _best_exchange, _clip_pair
 from workbench.culling.tally import new_tally
 from workbench.errors import InputError
@@ -46,18 +47,6 @@ THIN = 0.02
 """Distance of polygons, in extents of one, below which penumbrae are thin layers."""
 GRID = 8
 """Cells along a polygon that has too many event lines to be divided along them."""
-
-_S15 = math.sqrt(15.0)
-_A, _B = (6.0 - _S15) / 21.0, (6.0 + _S15) / 21.0
-_POINTS = np.array(
-    [
-        [1 / 3, 1 / 3, 1 / 3],
-        [1 - 2 * _A, _A, _A], [_A, 1 - 2 * _A, _A], [_A, _A, 1 - 2 * _A],
-        [1 - 2 * _B, _B, _B], [_B, 1 - 2 * _B, _B], [_B, _B, 1 - 2 * _B],
-    ]
-)  # fmt: skip
-_WEIGHTS = np.array([9 / 40, *[(155 - _S15) / 1200] * 3, *[(155 + _S15) / 1200] * 3])
-"""Radon's rule of seven points, exact to the fifth degree."""
 
 
 class FormFactor(float):
@@ -225,7 +214,7 @@ class _Blocked:
         fragments, sizes, weights = self.work
         if not _cell_values(
             np.ascontiguousarray(cells), self.normal, self.b, o.corners, o.start, o.normal, o.offset, o.through,
-            self.kept, len(self.kept), fragments, sizes, weights, _POINTS, _WEIGHTS, self.hidden, out,
+            self.kept, len(self.kept), fragments, sizes, weights, RADON_POINTS, RADON_WEIGHTS, self.hidden, out,
             new_tally(),
         ):  # fmt: skip
             raise InputError(
