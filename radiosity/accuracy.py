@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,10 +40,11 @@ from radiosity.solvers.solve import (
     solve_by_matrix,
 )
 from radiosity.solvers.solve import solve as solve_once
-from workbench.arrays import as_points, as_unit_vectors
+from workbench.arrays import as_fraction, as_places, as_positive
 from workbench.counters import Counters
 from workbench.errors import InputError, MemoryForecastError, OptionError
 from workbench.geometry.flat import Geometry
+from workbench.scene.load import load
 from workbench.scene.model import Scene
 from workbench.shadow.occlusion import Shader
 
@@ -272,7 +274,7 @@ def _order(levels: list[dict[str, Any]]) -> float:
 
 
 def solve(
-    scene: Scene,
+    scene: Scene | str | Path,
     *,
     error: float | None = None,
     budget_seconds: float | None = None,
@@ -288,8 +290,8 @@ def solve(
 
     Parameters
     ----------
-    scene : Scene
-        From :func:`workbench.load` or built in code.
+    scene : Scene, str or Path
+        From :func:`workbench.load` or built in code; or what that takes: a file, the name of a built-in scene.
     error : float, optional
         Wanted error, see :mod:`radiosity.accuracy`: root mean square over the surfaces, relative to
         the mean irradiance.  Meshes are refined until the estimate falls below it.  With ``elements``
@@ -314,13 +316,14 @@ def solve(
     InputError, OptionError, MemoryForecastError
         As :func:`radiosity.solvers.solve.solve`.
     """
+    scene = load(scene)
     fixed: dict[str, Any] = {"elements": elements, "max_edge": max_edge}
     if error is None and budget_seconds is None:
         return solve_once(scene, **fixed, progress=progress, checkpoint=checkpoint, resume=resume, **options)
-    if error is not None and not 0 < error < 1:
-        raise OptionError(f"error: found {error}, expected a number between 0 and 1")
-    if budget_seconds is not None and not (math.isfinite(budget_seconds) and budget_seconds > 0):
-        raise OptionError(f"budget_seconds: found {budget_seconds}, expected a positive number of seconds")
+    if error is not None:
+        error = as_fraction(error, "error")
+    if budget_seconds is not None:
+        budget_seconds = as_positive(budget_seconds, "budget_seconds", "a positive number of seconds")
     for name in ("tolerance", "form_factor_error"):
         if options.pop(name, None) is not None:
             raise OptionError(f"{name} and error were both given; the error decides the {name.replace('_', ' ')}")
@@ -328,11 +331,9 @@ def solve(
     if at is not None:
         if elements is not None or max_edge is not None:
             raise OptionError("at and a given mesh were both given; choose one of them")
-        places = as_points(at[0], "at, points"), as_unit_vectors(at[1], "at, normals")
-        if len(places[0]) != len(places[1]):
-            raise InputError(
-                f"at: found {len(places[0])} points and {len(places[1])} normals, expected as many of both"
-            )
+        if not isinstance(at, (tuple, list)) or len(at) != 2:
+            raise InputError("at: expected a pair (points, normals)")
+        places = as_places(*at)
     run = _Run(
         at=places,
         target=error if error is not None else 0.0,

@@ -35,6 +35,7 @@ from radiosity.regather import regathered
 from radiosity.sensors import Direct, DirectLight, Gatherer, allotted
 from radiosity.solvers.solution import Solution
 from workbench.accel.base import NO_POLYGON
+from workbench.arrays import as_fraction
 from workbench.counters import Counters
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
@@ -134,8 +135,7 @@ class GatherOptions:
     see_backs: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 < self.error < 1:
-            raise OptionError(f"error: found {self.error}, expected a number between 0 and 1")
+        as_fraction(self.error, "error")
         if self.rays is not None and not 1 <= self.rays <= 65536:
             raise OptionError(f"rays: found {self.rays}, expected 1 to 65536")
 

@@ -17,6 +17,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from workbench.arrays import as_count, as_positive
 from workbench.errors import OptionError
 from workbench.geometry.contacts import contact_lines, cut_along
 from workbench.geometry.flat import Geometry
@@ -480,10 +481,10 @@ def build_mesh(
     """
     if elements is not None and max_edge is not None:
         raise OptionError("elements and max_edge were both given; choose one of them")
-    if elements is not None and elements < 1:
-        raise OptionError(f"elements: found {elements}, expected 1 or more")
-    if max_edge is not None and not max_edge > 0:
-        raise OptionError(f"max_edge: found {max_edge}, expected a positive length")
+    if elements is not None:
+        elements = as_count(elements, "elements")
+    if max_edge is not None:
+        max_edge = as_positive(max_edge, "max_edge", "a positive length")
     edge, scales = math.inf, np.ones(geometry.polygon_count)
     if max_edge is not None:
         edge = max_edge

@@ -24,7 +24,7 @@ from radiosity._gather_kernels import RUNS, collect_hits, gather_rays, net_bits
 from radiosity.element_lookup import ElementLookup, bounding_rectangle, element_gradients
 from radiosity.patches import PatchMesh
 from radiosity.solvers.solution import Solution
-from workbench.arrays import as_points, as_unit_vectors
+from workbench.arrays import as_count, as_fraction, as_places
 from workbench.counters import Counters
 from workbench.culling.tally import BOX, CHECK, CLOSED, CUT, PIECES, add_tally, new_tally
 from workbench.errors import InputError, OptionError
@@ -317,16 +317,9 @@ class Gatherer(DirectLight):
         InputError, OptionError
             If an array has another shape or a number is out of range.
         """
-        place, facing = as_points(points), as_unit_vectors(normals)
-        if len(place) == 0:
-            raise InputError("points: found none, expected one or more")
-        if len(facing) == 1 and len(place) > 1:
-            facing = np.repeat(facing, len(place), axis=0)
-        if len(facing) != len(place):
-            raise InputError(f"normals: found {len(facing)} rows for {len(place)} points")
-        if not 0 < error < 1:
-            raise OptionError(f"error: found {error}, expected a number between 0 and 1")
-        if rays is not None and not 1 <= rays <= MOST_RAYS:
+        place, facing = as_places(points, normals)
+        error = as_fraction(error, "error")
+        if rays is not None and (rays := as_count(rays, "rays")) > MOST_RAYS:
             raise OptionError(f"rays: found {rays}, expected 1 to {MOST_RAYS}")
         counters, seconds = Counters(), {}
         begin = time.perf_counter()

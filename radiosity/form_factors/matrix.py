@@ -28,6 +28,7 @@ from radiosity.form_factors._refine import REFINING_RAYS, cell_workspace
 from radiosity.form_factors.hemisphere_rays import COUNTS, RANDOMISATIONS, HemisphereRays, predicted_rays, ray_exchanges
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
 from workbench.accel.embree import EmbreeAccelerator
+from workbench.arrays import as_count, as_fraction
 from workbench.culling.shaft import MAX_SHAFT_PLANES
 from workbench.culling.tally import add_tally, new_tally
 from workbench.errors import InputError, OptionError
@@ -35,6 +36,7 @@ from workbench.geometry.coplanar import Occluders, join_coplanar
 from workbench.geometry.flat import Geometry
 from workbench.memory import require_memory
 from workbench.record import RunRecord
+from workbench.scene.load import load
 from workbench.scene.model import Scene
 
 __all__ = ["ViewFactors", "close_rows", "exchange_areas", "view_factors"]
@@ -757,7 +759,7 @@ Progress = Callable[[float], None]
 
 
 def view_factors(
-    scene: Scene,
+    scene: Scene | str | Path,
     *,
     by: str = "patch",
     error: float = 1e-3,
@@ -771,7 +773,8 @@ def view_factors(
 
     Parameters
     ----------
-    scene : Scene
+    scene : Scene, str or Path
+        A scene, or what :func:`workbench.load` takes.
     by : str
         ``patch``: a row a polygon (or an element of it, see below); ``surface``: a row a surface, the
         area-weighted mean over its polygons.  A two-sided surface has a row a side.
@@ -809,13 +812,11 @@ def view_factors(
     In a scene declared closed rows are closed by a symmetric scaling, see :func:`close_rows`; a row on which
     something stands and that lacks more than 1 % (and than four times its error) is covered and keeps what it has.
     """
-    threads = workers if workers is not None else len(os.sched_getaffinity(0))
+    scene = load(scene)
+    threads = as_count(workers, "workers") if workers is not None else len(os.sched_getaffinity(0))
     if by not in ("patch", "surface"):
         raise OptionError(f"by: found {by!r}, expected 'patch' or 'surface'")
-    if not (math.isfinite(error) and 0 < error < 1):
-        raise OptionError(f"error: found {error}, expected a number between 0 and 1")
-    if threads < 1:
-        raise OptionError(f"workers: found {threads}, expected 1 or more")
+    error, seed = as_fraction(error, "error"), as_count(seed, "seed", 0)
     where = str(scene.path) if scene.path is not None else scene.name
     if not any(surface.face_count for surface in scene.surfaces):
         raise InputError(f"{where}: found no surface; add a [[surface]] to the scene")

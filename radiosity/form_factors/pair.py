@@ -10,7 +10,7 @@ meshing, D. Lischinski, F. Tampieri and D. P. Greenberg 1992).  No visible slive
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from radiosity.form_factors import _pairs
 from radiosity.form_factors._sampling import RADON_POINTS, RADON_WEIGHTS
 from radiosity.form_factors.analytic import _as_pieces, _best_exchange, _clip_pair
+from workbench.arrays import as_positive
 from workbench.culling.tally import new_tally
 from workbench.errors import InputError
 from workbench.geometry.coplanar import Occluders, join_coplanar
@@ -276,7 +277,9 @@ def _as_rings(polygon: Any, name: str) -> list[FloatArray]:
         ) from None
 
 
-def _occluders(polygons: Sequence[Any], reach: FloatArray) -> Occluders:
+def _occluders(polygons: Sequence[Any]) -> Occluders:
+    if not isinstance(polygons, Iterable):
+        raise InputError(f"occluders: found {polygons!r}, expected a list of polygons")
     faces = []
     for index, polygon in enumerate(polygons):
         rings = _as_rings(polygon, f"occluders[{index}]")
@@ -345,15 +348,14 @@ def form_factor(
     -----
     ``A_a F_ab = A_b F_ba`` holds within the errors: the smaller polygon is the one integrated over.
     """
-    if not (math.isfinite(error) and error > 0):
-        raise InputError(f"error: found {error!r}, expected a positive number such as 1e-6")
+    error = as_positive(error, "error", "a positive number such as 1e-6")
     ends = []
     for name, polygon in (("polygon_a", polygon_a), ("polygon_b", polygon_b)):
         outer, *holes = _as_rings(polygon, name)
         ends.append(_as_pieces(outer, holes, name))
     (pieces_a, normal_a, area_a), (pieces_b, normal_b, area_b) = ends
     corners = np.concatenate([*pieces_a, *pieces_b])
-    blockers = _occluders(occluders, corners)
+    blockers = _occluders(occluders)
     size = float(np.ptp(np.concatenate([corners, blockers.corners]), axis=0).max())
     slack = 1e-12 * size + 16.0 * float(np.finfo(np.float64).eps) * float(np.abs(corners).max())
     swapped = area_b < area_a

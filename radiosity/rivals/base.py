@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from workbench.arrays import as_points, as_unit_vectors
+from workbench.arrays import as_count, as_places
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
 from workbench.scene.model import Camera, Scene
@@ -116,10 +116,8 @@ class Rival:
 
 def checked_points(points: ArrayLike, normals: ArrayLike, samples: int) -> tuple[FloatArray, FloatArray]:
     """Points and unit normals, both (n, 3); an option error for a bad number of samples."""
-    if samples < 1:
-        raise OptionError(f"samples: found {samples}, expected 1 or more")
-    points = as_points(points, "points")
-    return points, as_unit_vectors(np.broadcast_to(np.asarray(normals, dtype=np.float64), points.shape), "normals")
+    as_count(samples, "samples")
+    return as_places(points, normals)
 
 
 def band_triples(bands: int) -> list[NDArray[np.int64]]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radiosity.rivals.base import Rival, band_triples, checked_points
-from workbench.errors import OptionError
+from workbench.arrays import as_count
 from workbench.scene.model import Camera, Light, Scene
 
 __all__ = ["Mitsuba"]
@@ -178,8 +178,7 @@ class Mitsuba(Rival):
 
     def picture(self, camera: Camera, *, samples: int, seed: int = 0, direct_only: bool = False) -> FloatArray:
         """A picture (height, width, bands) by ``samples`` paths a pixel. [W m-2 sr-1]"""
-        if samples < 1:
-            raise OptionError(f"samples: found {samples}, expected 1 or more")
+        as_count(samples, "samples")
         mi = self._mi = _module(self.variant)
         eye, target, up = (np.asarray(v, dtype=float).tolist() for v in (camera.eye, camera.look_at, camera.up))
         sensor = mi.load_dict({

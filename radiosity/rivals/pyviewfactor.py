@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from radiosity.patches import build_mesh
 from radiosity.rivals.base import Rival
+from workbench.arrays import as_count
 from workbench.errors import OptionError
 from workbench.memory import require_memory
 
@@ -36,8 +37,7 @@ class PyViewFactor(Rival):
         import pyvista
         from pyviewfactor import compute_viewfactor_matrix
 
-        if samples < 1:
-            raise OptionError(f"samples: found {samples}, expected 1 or more")
+        as_count(samples, "samples")
         if any(material.two_sided for material in self.geometry.surface_material):
             raise OptionError("pyviewfactor: found a two-sided surface, expected one-sided ones")
         polygons = self.geometry.polygon_count

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radiosity.rivals.base import Rival, band_triples, checked_points
+from workbench.arrays import as_count
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
 from workbench.render.camera import PinholeRays
@@ -151,8 +152,7 @@ class Radiance(Rival):
 
         Each ray follows one path: many parts of a source or ambient divisions would be wasted on it.
         """
-        if samples < 1:
-            raise OptionError(f"samples: found {samples}, expected 1 or more")
+        as_count(samples, "samples")
         pinhole = PinholeRays.from_camera(camera)
         pixel = np.repeat(np.arange(camera.height * camera.width), samples)
         place = np.random.default_rng(seed).random((2, len(pixel)))

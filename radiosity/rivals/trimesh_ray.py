@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radiosity.rivals.base import Rival, checked_points
+from workbench.arrays import as_count
 from workbench.errors import OptionError
 from workbench.geometry.polygons import plane_basis
 from workbench.sampling.warp import square_to_cosine_hemisphere
@@ -86,8 +87,7 @@ class TrimeshRay(Rival):
 
     def view_factors(self, *, samples: int, seed: int = 0) -> FloatArray:
         """Form factors (q, q) by ``samples`` cosine-weighted rays from each polygon's lit side."""
-        if samples < 1:
-            raise OptionError(f"samples: found {samples}, expected 1 or more")
+        as_count(samples, "samples")
         if any(material.two_sided for material in self.geometry.surface_material):
             raise OptionError("trimesh: found a two-sided surface, expected one-sided ones")
         rng = np.random.default_rng(seed)

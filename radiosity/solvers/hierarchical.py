@@ -73,6 +73,7 @@ from radiosity.solvers.progressive import CHECKPOINT_SECONDS, CHECKPOINT_SHARE, 
 from radiosity.solvers.solution import Checkpoint, EnergyBook, Progress, ProgressEvent, Solution
 from workbench.accel.box_tree import BoxTree
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
+from workbench.arrays import as_count, as_positive
 from workbench.counters import Counters
 from workbench.culling.tally import add_tally, new_tally
 from workbench.errors import InputError, OptionError
@@ -995,13 +996,13 @@ def solve_hierarchical(
     """
     if link_error is None and max_elements is None:
         raise OptionError("link_error and max_elements were both left out; give one of them")
-    if link_error is not None and not (math.isfinite(link_error) and link_error > 0):
-        raise OptionError(f"link_error: found {link_error}, expected a positive number such as 1e-3")
+    if link_error is not None:
+        link_error = as_positive(link_error, "link_error", "a positive number such as 1e-3")
     for name, length in (("min_edge", min_edge), ("max_edge", max_edge)):
-        if length is not None and not (math.isfinite(length) and length > 0):
-            raise OptionError(f"{name}: found {length}, expected a positive length")
-    if max_elements is not None and max_elements < 1:
-        raise OptionError(f"max_elements: found {max_elements}, expected 1 or more")
+        if length is not None:
+            as_positive(length, name, "a positive length")
+    if max_elements is not None:
+        max_elements = as_count(max_elements, "max_elements")
     solver = _Solver(
         scene,
         geometry,

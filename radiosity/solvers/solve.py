@@ -18,6 +18,7 @@ from radiosity.solvers.incident import incident_irradiance
 from radiosity.solvers.progressive import shoot_until
 from radiosity.solvers.solution import Checkpoint, EnergyBook, Progress, Solution
 from workbench.accel.embree import EmbreeAccelerator
+from workbench.arrays import as_count, as_fraction, as_positive
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.memory import available_bytes, require_memory
@@ -111,15 +112,15 @@ def _check(scene: Scene, settings: dict[str, Any]) -> None:
         raise OptionError(f"method: found {method!r}, expected one of {', '.join(METHODS)}")
     if elements is not None and max_edge is not None:
         raise OptionError("elements and max_edge were both given; choose one of them")
-    if elements is not None and elements < 1:
-        raise OptionError(f"elements: found {elements}, expected 1 or more")
-    if max_edge is not None and not (math.isfinite(max_edge) and max_edge > 0):
-        raise OptionError(f"max_edge: found {max_edge}, expected a positive length")
-    for name in ("rays", "workers"):
-        if settings[name] < 1:
-            raise OptionError(f"{name}: found {settings[name]}, expected 1 or more")
-    if not 0 < settings["tolerance"] < 1:
-        raise OptionError(f"tolerance: found {settings['tolerance']}, expected a number between 0 and 1")
+    if elements is not None:
+        settings["elements"] = as_count(elements, "elements")
+    if max_edge is not None:
+        settings["max_edge"] = as_positive(max_edge, "max_edge", "a positive length")
+    for name, least in (("rays", 1), ("workers", 1), ("seed", 0)):
+        settings[name] = as_count(settings[name], name, least)
+    for name in ("tolerance", "form_factor_error"):
+        if settings[name] is not None:
+            settings[name] = as_fraction(settings[name], name)
     where = str(scene.path) if scene.path is not None else scene.name
     if not any(surface.face_count for surface in scene.surfaces):
         raise InputError(f"{where}: found no surface; add a [[surface]] to the scene")
@@ -368,7 +369,7 @@ def begin(scene: Scene, **options: Unpack[SolveOptions]) -> RunRecord:
         settings["workers"] = len(os.sched_getaffinity(0))
     _check(scene, settings)
     method, elements, max_edge = settings["method"], settings["elements"], settings["max_edge"]
-    bundles, form_factor_error = settings["bundles"], settings["form_factor_error"]
+    bundles = settings["bundles"]
     if method != "hierarchical":
         if settings["link_error"] is not None or not settings["direct_in_mesh"]:
             raise OptionError(f"link_error and direct_in_mesh: found with method {method!r}, expected 'hierarchical'")
@@ -383,8 +384,6 @@ def begin(scene: Scene, **options: Unpack[SolveOptions]) -> RunRecord:
             f"bundles: found {bundles!r} with method 'hierarchical', which has links of its own;"
             " choose method 'progressive' or 'direct'"
         )
-    if form_factor_error is not None and not 0 < form_factor_error < 1:
-        raise OptionError(f"form_factor_error: found {form_factor_error}, expected a number between 0 and 1")
     _forecast(scene, elements, max_edge, method)
     return RunRecord(command="solve", settings=settings)
 

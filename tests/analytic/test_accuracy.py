@@ -184,7 +184,7 @@ def test_the_error_can_be_asked_for_where_it_matters():
     assert np.abs(plain.element_irradiance[dim] / 2e-3 - 1).max() < 0.02
     assert plain.record.choices["method"].startswith("matrix")
     assert "given points" in solution.record.errors["definition"]
-    with pytest.raises(InputError, match="as many of both"):
-        radiosity.solve(scene, error=0.02, at=(points, normals[:1]))
+    with pytest.raises(InputError, match="found 2 rows for"):
+        radiosity.solve(scene, error=0.02, at=(points[:1], normals))
     with pytest.raises(OptionError, match="given mesh"):
         radiosity.solve(scene, error=0.02, at=(points, normals), elements=50)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from workbench.accel.base import Hits
 from workbench.accel.group_volumes import GroupVolumes
-from workbench.arrays import as_points, as_unit_vectors
+from workbench.arrays import as_count, as_points, as_unit_vectors
 from workbench.counters import Counters
 from workbench.errors import OptionError
 from workbench.geometry.flat import Geometry
@@ -206,9 +206,7 @@ class RayCaster:
     ) -> None:
         if accelerator not in ACCELERATORS:
             raise OptionError(f"accelerator: found {accelerator!r}, expected one of {', '.join(ACCELERATORS)}")
-        self.workers = workers if workers is not None else os.cpu_count() or 1
-        if self.workers < 1:
-            raise OptionError(f"workers: found {workers}, expected 1 or more")
+        self.workers = as_count(workers, "workers") if workers is not None else os.cpu_count() or 1
         self.scene = scene
         self._groups = GroupVolumes(scene, volumes)
         self._accelerator: GroupVolumes | _Voxels | _Embree = self._groups

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from workbench.accel.base import NO_POLYGON
 from workbench.accel.embree import EmbreeAccelerator
-from workbench.arrays import as_bands, as_points, as_unit_vectors
+from workbench.arrays import as_bands, as_count, as_fraction, as_points, as_unit_vectors
 from workbench.counters import Counters
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
@@ -112,8 +112,7 @@ class TraceOptions:
             found = getattr(self, name)
             if found is not None and not 1 <= found <= 4096:
                 raise OptionError(f"{name}: found {found}, expected 1 to 4096")
-        if not 0.0 < self.shadow_error < 1.0:
-            raise OptionError(f"shadow_error: found {self.shadow_error}, expected a number between 0 and 1")
+        as_fraction(self.shadow_error, "shadow_error")
 
 
 @dataclass
@@ -435,8 +434,7 @@ class Tracer:
         textures: Mapping[str, Texture] | None = None,
         workers: int = 1,
     ) -> None:
-        if workers < 1:
-            raise OptionError(f"workers: found {workers}, expected 1 or more")
+        workers = as_count(workers, "workers")
         self.scene, self.options, self.workers = scene, options or TraceOptions(), workers
         self.bands = scene.bands
         self._ambient = as_bands(self.options.ambient, self.bands, "ambient")

@@ -47,14 +47,15 @@ def built_in_scenes() -> dict[str, str]:
     return found
 
 
-def load(path: str | Path) -> Scene:
+def load(path: str | Path | Scene) -> Scene:
     """Read a scene.
 
     Parameters
     ----------
-    path : str or Path
+    path : str, Path or Scene
         A file whose suffix is one of :data:`SUFFIXES` (in small or capital letters), or the name of
-        a built-in scene such as ``"cornell-box"``; a file of that name comes first.
+        a built-in scene such as ``"cornell-box"``; a file of that name comes first.  A scene is
+        handed back as it is, so that what takes a scene takes its name, too.
 
     Returns
     -------
@@ -73,7 +74,12 @@ def load(path: str | Path) -> Scene:
     workbench.scene.rad : what becomes of Radiance files.
     workbench.scene.mesh : what becomes of OBJ, PLY, STL, GLB and glTF files.
     """
-    path = Path(path)
+    if isinstance(path, Scene):
+        return path
+    try:
+        path = Path(path)
+    except TypeError:
+        raise SceneError(f"scene: found {path!r}, expected a Scene, a file or the name of a built-in scene") from None
     name = path.name.lower()
     suffix = next((known for known in sorted(_READERS, key=len, reverse=True) if name.endswith(known)), None)
     if suffix is not None:

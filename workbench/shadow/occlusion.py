@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from workbench.accel.box_tree import BoxTree, boxes_meeting_planes
 from workbench.accel.embree import EmbreeAccelerator
 from workbench.accel.voxel_grid import VoxelGrid
-from workbench.arrays import as_points, as_unit_vectors
+from workbench.arrays import as_count, as_fraction, as_places, as_points
 from workbench.counters import Counters
 from workbench.culling.plane_vertex import CHECK_SLACK
 from workbench.culling.shaft import MAX_SHAFT_PLANES, box_shaft
@@ -291,9 +291,7 @@ class Shader:
 
     def __init__(self, geometry: Geometry, workers: int | None = None) -> None:
         self.geometry = geometry
-        self.workers = workers if workers is not None else len(os.sched_getaffinity(0))
-        if self.workers < 1:
-            raise OptionError(f"workers: found {workers}, expected 1 or more")
+        self.workers = as_count(workers, "workers") if workers is not None else len(os.sched_getaffinity(0))
         self._box_tree = tree = BoxTree.build(geometry)
         self._frames: dict[bytes, SenderFrame] = {}
         self._through = np.ascontiguousarray(geometry.polygon_transmittance[geometry.piece_polygon])
@@ -345,19 +343,10 @@ class Shader:
         own_polygon: ArrayLike | None = None,
     ) -> OcclusionEstimate:
         """See :func:`estimate`."""
-        where, facing = as_points(points), as_unit_vectors(normals)
-        if len(where) == 0:
-            raise InputError("points: found none, expected one or more")
-        if len(facing) == 1 and len(where) > 1:
-            facing = np.repeat(facing, len(where), axis=0)
-        if len(facing) != len(where):
-            raise InputError(f"normals: found {len(facing)} rows for {len(where)} points")
+        where, facing = as_places(points, normals)
         if method not in METHODS:
             raise OptionError(f"method: found {method!r}, expected one of {', '.join(METHODS)}")
-        if not 0 < error < 1:
-            raise OptionError(f"error: found {error}, expected a number between 0 and 1")
-        if samples < 1:
-            raise OptionError(f"samples: found {samples}, expected 1 or more")
+        error, samples = as_fraction(error, "error"), as_count(samples, "samples")
         chosen = list(lights) if isinstance(lights, Sequence) else [lights]
         if not chosen:
             raise InputError("lights: found none, expected one or more")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from workbench.arrays import as_count
 from workbench.errors import InputError
 from workbench.record import RunRecord, write_text_atomically
 
@@ -69,8 +70,7 @@ def interleaved(
     InputError
         If ``repeats`` is less than 1.
     """
-    if repeats < 1:
-        raise InputError(f"repeats: found {repeats}, expected 1 or more")
+    repeats = as_count(repeats, "repeats")
     seconds: dict[str, list[float]] = {name: [] for name in tasks}
     answers: dict[str, Any] = {}
     for turn in range(repeats):
