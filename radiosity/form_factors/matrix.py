@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
@@ -25,6 +25,7 @@ from radiosity.form_factors import _pairs, _stripes
 from radiosity.form_factors._covered import covered_pieces
 from radiosity.form_factors._ray_shares import MOST_RAYS, ray_shares
 from radiosity.form_factors._refine import REFINING_RAYS, cell_workspace
+from radiosity.form_factors._symmetric import SymmetricMatrix
 from radiosity.form_factors.hemisphere_rays import COUNTS, RANDOMISATIONS, HemisphereRays, predicted_rays, ray_exchanges
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
 from workbench.accel.embree import EmbreeAccelerator
@@ -44,7 +45,7 @@ __all__ = ["ViewFactors", "close_rows", "exchange_areas", "view_factors"]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Matrix = Any
-"""A dense numpy array or a scipy.sparse.csr_array, (n, n)."""
+"""A dense numpy array, a scipy.sparse.csr_array or, of solves, a :class:`SymmetricMatrix`, (n, n)."""
 
 LEAF = 8
 """Most pieces of a leaf of the tree of pairs."""
@@ -65,6 +66,8 @@ ROUNDS = 200
 """Most rounds of the scaling that closes rows."""
 DENSE_ENTRY, SPARSE_ENTRY = 12, 16
 """Bytes of a value and its error, and of those with a column: the smaller whole decides."""
+SOLVE_ENTRY = 4.0
+"""Bytes of an entry of a solve's matrix: half of it in single precision, its patches', what waits for its place."""
 CLOSED_TO = 1e-10
 """Error of a row sum at which the scaling ends."""
 PAIR_SECONDS = 2e-7
@@ -516,6 +519,11 @@ class _Engine:
         finally:
             self._idle.append(scratch)
 
+    def pairs_after(self, node: int) -> int:
+        """Twice the number of pairs of a stripe."""
+        first, last = int(self.tree.first[node]), int(self.tree.last[node])
+        return (last - first) * (2 * self.pieces.count - first - last)
+
     def _by_rays(
         self, pairs: IntArray, base: int, out: FloatArray, spread: FloatArray, importance: FloatArray, threshold: float
     ) -> int:
@@ -555,7 +563,7 @@ class _Engine:
             return self._tracer
 
 
-def close_rows(exchange: Matrix, wanted: FloatArray) -> FloatArray:
+def close_rows(exchange: Matrix, wanted: FloatArray, to: float = CLOSED_TO) -> FloatArray:
     """Scale factors x so that ``x_i x_j S_ij`` has the wanted row sums; rows of nothing keep 1.
 
     Symmetric scaling keeps reciprocity, zeros and signs (cf. J. van Leersum, "A method for determining a
@@ -564,10 +572,13 @@ def close_rows(exchange: Matrix, wanted: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    exchange : (n, n) float, dense or sparse
+    exchange : (n, n) float, dense, sparse or a SymmetricMatrix
         Symmetric exchange areas A_i F_ij.
     wanted : (n,) float
         Row sums to reach: the areas, without what is covered of them.
+    to : float
+        Relative error of a row sum at which the scaling ends.  Two faces of a narrow gap see hardly more than each
+        other: their sums close very slowly.
 
     Returns
     -------
@@ -579,10 +590,10 @@ def close_rows(exchange: Matrix, wanted: FloatArray) -> FloatArray:
         live = (sums > 0) & (wanted > 0)
         ratio = np.divide(wanted, sums, out=np.ones(len(wanted)), where=live)
         off = float(np.abs(ratio - 1.0).max(initial=0.0))
-        if off < CLOSED_TO:
+        if off < to:
             break
         # A step leaves the square of what was off: to solve for it more closely would be wasted.
-        fraction = min(max(off, 0.1 * CLOSED_TO / off), 0.01)
+        fraction = min(max(off, 0.1 * to / off), 0.01)
         step = _newton_step(exchange, x, sums, np.where(live, wanted - sums, 0.0), fraction)
         # Far from the goal a step could turn a sign: there the plain scaling goes on.
         x *= 1.0 + step if np.abs(step).max() < 0.3 else np.sqrt(ratio)
@@ -931,8 +942,10 @@ def exchange_areas(
     workers: int = 1,
     seed: int = 0,
     progress: Progress | None = None,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[SymmetricMatrix, FloatArray, FloatArray]:
     """Exchange areas ``A_i F_ij`` between the elements of a mesh, reciprocal by construction, and their errors.
+
+    Errors are kept summed up: what they do to the light of a solution needs no more.
 
     Parameters
     ----------
@@ -946,8 +959,12 @@ def exchange_areas(
 
     Returns
     -------
-    exchange, spread : (n, n) float
-        [scene lengths squared]
+    exchange : SymmetricMatrix
+        (n, n). [scene lengths squared]
+    doubt : (n,) float
+        Sum of the errors of each row. [scene lengths squared]
+    square : (n,) float
+        Sum over i of the square of the error of ``A_i F_ij``, over ``A_i``. [scene lengths squared]
 
     Raises
     ------
@@ -955,9 +972,42 @@ def exchange_areas(
         If the matrix would not fit in memory.
     """
     n = mesh.element_count
+    require_memory(SOLVE_ENTRY * n**2, f"a matrix of {n} x {n} form factors", "ask for fewer elements")
     engine = _Engine(_Elements.of_mesh(mesh), geometry, _Care.for_error(error, n, loose=False), seed)
-    require_memory(3.0 * DENSE_ENTRY * n**2, f"a matrix of {n} x {n} form factors", "ask for fewer elements")
-    return _all_exchanges(engine, engine.pieces.owner, mesh.element_area, workers, record, progress, dense=True)
+    pieces, row_of = engine.pieces.count, engine.pieces.owner.astype(np.int32)
+    exchange = SymmetricMatrix.empty(n)
+    doubt, square = np.zeros(n), np.zeros(n)
+    with _threads(workers, pieces) as each:
+        work = partial(engine.stripe, row_of=row_of, importance=1.0 / mesh.element_area[row_of] / n)
+        done = 0
+        for node, stripe in _told(engine.tree.stripes.tolist(), work, each, record):
+            exchange.add(stripe.row, stripe.column, stripe.value)
+            _add_errors(stripe.row, stripe.column, stripe.error, mesh.element_area, doubt, square)
+            done += engine.pairs_after(node)
+            if progress is not None:
+                progress(min(done / pieces**2, 1.0))
+    return exchange, doubt, square
+
+
+def _told(
+    nodes: list[int], work: Callable[[int], _Stripe], each: Callable[..., Any], record: RunRecord
+) -> Iterator[tuple[int, _Stripe]]:
+    """Stripes as they are found, counted in the record."""
+    for node, stripe in zip(nodes, each(work, nodes), strict=True):
+        add_tally(record.counters, stripe.tally)
+        record.counters.add(rays=stripe.rays)
+        yield node, stripe
+
+
+@njit(nogil=True, cache=True)
+def _add_errors(r, c, error, area, doubt, square):
+    """Add the errors of pairs to the sums of both rows, and their squares over the other's area."""
+    for k in range(r.shape[0]):
+        i, j, e = r[k], c[k], error[k]
+        doubt[i] += e
+        doubt[j] += e
+        square[i] += e * e / area[j]
+        square[j] += e * e / area[i]
 
 
 def _all_exchanges(
@@ -967,11 +1017,9 @@ def _all_exchanges(
     threads: int,
     record: RunRecord,
     progress: Progress | None,
-    error: float = math.inf,
-    *,
-    dense: bool = False,
+    error: float,
 ) -> tuple[Matrix, Matrix]:
-    """Symmetric exchange areas between rows and their errors, ``dense`` or sparse, whichever is smaller.
+    """Symmetric exchange areas between rows and their errors, dense or sparse, whichever is smaller.
 
     Where the stated error is above ``error``, the pairs that make it are refined.
     """
@@ -982,13 +1030,11 @@ def _all_exchanges(
 
     def run(stripes: list[int], threshold: float) -> None:
         done = 0
-        results = each(lambda node: engine.stripe(node, row_of, importance, threshold), stripes)
-        for node, stripe in zip(stripes, results, strict=True):
-            add_tally(record.counters, stripe.tally)
-            record.counters.add(rays=stripe.rays)
+        work = partial(engine.stripe, row_of=row_of, importance=importance, threshold=threshold)
+        for node, stripe in _told(stripes, work, each, record):
             # Several pieces a row: add up what belongs together at once.
             found[node] = stripe if rows == n else stripe.merged(rows)
-            done += int((tree.last[node] - tree.first[node]) * (2 * n - tree.first[node] - tree.last[node]))
+            done += engine.pairs_after(node)
             if progress is not None and threshold == math.inf:
                 progress(min(done / n**2, 1.0))
 
@@ -1012,7 +1058,7 @@ def _all_exchanges(
         if rows < n:
             r, c, value, doubt = (np.concatenate([part[k] for part in parts]) for k in range(4))
             parts = [_merged(r, c, value, doubt, rows)]
-        return _symmetric(parts, rows, each, dense)
+        return _symmetric(parts, rows, each)
 
 
 def _merged(
@@ -1073,14 +1119,14 @@ def _blocks(rows: int) -> list[tuple[int, int]]:
     return [(first, min(first + BLOCK_ROWS, rows)) for first in range(0, rows, BLOCK_ROWS)]
 
 
-def _symmetric(parts: list[tuple[Any, ...]], rows: int, each: Callable[..., Any], dense: bool) -> tuple[Matrix, Matrix]:
+def _symmetric(parts: list[tuple[Any, ...]], rows: int, each: Callable[..., Any]) -> tuple[Matrix, Matrix]:
     """The whole matrices of distinct pairs (r, c, value, error), which are given up on the way."""
     for r, c, value, error in parts:
         # Pieces of one row that see each other do so both ways.
         value[r == c] *= 2.0
         error[r == c] *= math.sqrt(2.0)
     count = sum(2 * len(r) - int((r == c).sum()) for r, c, _, _ in parts)
-    if dense or SPARSE_ENTRY * count >= DENSE_ENTRY * rows**2:
+    if SPARSE_ENTRY * count >= DENSE_ENTRY * rows**2:
         whole, whole_error = np.zeros((rows, rows)), np.zeros((rows, rows), dtype=np.float32)
         while parts:
             r, c, value, error = parts.pop()

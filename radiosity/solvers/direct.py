@@ -7,8 +7,9 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
+from radiosity.form_factors._symmetric import SymmetricMatrix
 from radiosity.form_factors.bundle import ColumnFinder
-from radiosity.form_factors.matrix import close_rows, exchange_areas
+from radiosity.form_factors.matrix import CLOSED_TO, close_rows, exchange_areas
 from radiosity.solvers.lamps import lamp_irradiance, lamps_of_scene
 from radiosity.solvers.progressive import receive
 from radiosity.solvers.solution import Progress, ProgressEvent, Solution
@@ -22,10 +23,10 @@ IntArray = NDArray[np.int64]
 COLUMNS_A_STEP = 32
 SOLVED_TO, MOST_STEPS = 1e-14, 2000
 """Relative residual at which the linear equations count as solved, and most steps towards it."""
+CLOSED_SHARE = 1e-3
+"""Error of a row sum that is left when rows are closed, over the wanted error of the form factors in it."""
 COVERED = 0.01
 """Share of an element of a closed scene that must see nothing to count as covered (the floor under a box)."""
-ROWS_A_STEP = 256
-"""Rows of a matrix that are worked on at once, where its size must not be needed twice."""
 
 
 def solve_direct(solution: Solution, bundles: ColumnFinder, *, closed: bool, progress: Progress | None = None) -> None:
@@ -58,7 +59,8 @@ def solve_direct(solution: Solution, bundles: ColumnFinder, *, closed: bool, pro
     exchange = factor * mesh.element_area[:, None]
     record.errors["reciprocity"] = float(np.abs(exchange - exchange.T).max() / max(float(exchange.max()), 1e-300))
     with record.stage("solve"):
-        seen = solve_exchange(solution, 0.5 * (exchange + exchange.T), factor.sum(axis=1), doubt, closed=closed)
+        whole = SymmetricMatrix.of_dense(0.5 * (exchange + exchange.T))
+        seen = solve_exchange(solution, whole, factor.sum(axis=1), doubt, closed=closed)
     square = mean_square.T @ _told_apart(seen, mesh.element_area, closed) ** 2
     solution.state_irradiance_error(form_factors=square[0], visibility=square[1])
     record.counters.merge(bundles.counters)
@@ -71,11 +73,7 @@ def _told_apart(seen: FloatArray, area: FloatArray, closed: bool) -> FloatArray:
     return seen - (area @ seen) / area.sum() if closed else seen
 
 
-def _row_blocks(rows: int) -> list[slice]:
-    return [slice(first, min(first + ROWS_A_STEP, rows)) for first in range(0, rows, ROWS_A_STEP)]
-
-
-def _bounce(exchange: FloatArray, area: FloatArray, rho: FloatArray, before: FloatArray) -> FloatArray:
+def _bounce(exchange: SymmetricMatrix, area: FloatArray, rho: FloatArray, before: FloatArray) -> FloatArray:
     """Radiosity B of ``B = before + rho F B``, all bands at once, by conjugate gradients.
 
     Where rho > 0 the equations times area / rho are symmetric and positive definite; black elements
@@ -83,7 +81,7 @@ def _bounce(exchange: FloatArray, area: FloatArray, rho: FloatArray, before: Flo
     algorithms with positive definite radiosity matrix", 1994).  ``area`` is (n, 1).
     """
     live = rho > 0
-    diagonal = np.where(live, area / np.where(live, rho, 1.0) - np.diag(exchange)[:, None], 1.0)
+    diagonal = np.where(live, area / np.where(live, rho, 1.0) - exchange.diagonal()[:, None], 1.0)
 
     def times(x: FloatArray) -> FloatArray:
         return np.where(live, area / np.where(live, rho, 1.0) * x - exchange @ np.where(live, x, 0.0), 0.0)
@@ -111,7 +109,13 @@ def _bounce(exchange: FloatArray, area: FloatArray, rho: FloatArray, before: Flo
 
 
 def solve_exchange(
-    solution: Solution, exchange: FloatArray, sums: FloatArray, doubt: FloatArray, *, closed: bool
+    solution: Solution,
+    exchange: SymmetricMatrix,
+    sums: FloatArray,
+    doubt: FloatArray,
+    *,
+    closed: bool,
+    closed_to: float = CLOSED_TO,
 ) -> FloatArray:
     """Solve for all light that is still to be exchanged, given the exchange areas between all elements.
 
@@ -119,12 +123,14 @@ def solve_exchange(
     ----------
     solution : Solution
         Changed in place: what is unshot is shot, with all that follows from it.
-    exchange : (n, n) float
-        Symmetric exchange areas A_i F_ij; in a closed scene balanced in place. [scene lengths squared]
+    exchange : SymmetricMatrix
+        (n, n): exchange areas A_i F_ij; in a closed scene balanced in place. [scene lengths squared]
     sums, doubt : (n,) float
         Row sums of the form factors as found, and their errors.
     closed : bool
         Whether the elements are an enclosure, so that rows are balanced.
+    closed_to : float
+        Error of a row sum that may then be left.
 
     Returns
     -------
@@ -133,7 +139,7 @@ def solve_exchange(
     """
     mesh, record = solution.mesh, solution.record
     n, area = mesh.element_count, mesh.element_area
-    scale = max(float(exchange.max()), 1e-300)
+    scale = max(exchange.max(), 1e-300)
     record.errors["row_sum"] = {
         "min": float(sums.min()),
         "mean": float(sums.mean()),
@@ -143,13 +149,8 @@ def solve_exchange(
     }
     visible = np.ones(n)
     if closed:
-        visible = _visible_shares(exchange.sum(axis=1) / area, doubt)
-        x = close_rows(exchange, area * visible)
-        change = 0.0
-        for rows in _row_blocks(n):
-            before = exchange[rows].copy()
-            exchange[rows] *= x[rows, None] * x
-            change = max(change, float(np.abs(exchange[rows] - before).max()))
+        visible = _visible_shares(exchange @ np.ones(n) / area, doubt)
+        change = exchange.scale_by(close_rows(exchange, area * visible, closed_to))
         record.errors["row_balance_correction"] = change / scale
         record.results["covered_elements"] = int((visible < 1.0).sum())
     share = np.where(visible > 0, visible, 1.0)[:, None]
@@ -182,14 +183,6 @@ def _visible_shares(sums: FloatArray, doubt: FloatArray) -> FloatArray:
     that exchanges light, and its row sums to 1.
     """
     return np.where(1.0 - sums > np.maximum(doubt, COVERED), sums, 1.0)
-
-
-def _summed(matrix: FloatArray, start: IntArray) -> FloatArray:
-    """Entries of a square matrix added up over groups of neighbouring rows and columns."""
-    out = np.empty((len(start) - 1, len(start) - 1))
-    for k in range(len(start) - 1):
-        out[k] = np.add.reduceat(matrix[start[k] : start[k + 1]].sum(axis=0), start[:-1])
-    return out
 
 
 def solve_matrix(
@@ -232,16 +225,16 @@ def solve_matrix(
         if progress is not None:
             progress(ProgressEvent(0, 1.0 - done, 0.0, time.perf_counter() - start, "form factors"))
 
-    square = np.zeros((2, mesh.bands))
+    square, closed_to = np.zeros((2, mesh.bands)), CLOSED_SHARE * error
     lamps = lamps_of_scene(solution.scene, shader.geometry)
     try:
         report(0.0)
         with record.stage("form factors"):
-            exchange, spread = exchange_areas(
+            exchange, doubt, spread = exchange_areas(
                 mesh, shader.geometry, record, error=error, workers=workers, seed=seed, progress=report
             )
             area = mesh.element_area
-            sums, doubt = exchange.sum(axis=1) / area, spread.sum(axis=1, dtype=np.float64) / area
+            sums, doubt = exchange @ np.ones(n) / area, doubt / area
         if lamps:
             with record.stage("light of lamps"):
                 visible = _visible_shares(sums, doubt) if closed else None
@@ -257,12 +250,10 @@ def solve_matrix(
                 emits = np.flatnonzero(coarse.mesh.emission.any(axis=1))
                 _receive_lamps(coarse, mesh.patch_mean(light.irradiance), emits)
             row_sums, doubts = (mesh.patch_mean(each[:, None])[:, 0] for each in (sums, doubt))
-            solve_exchange(coarse, _summed(exchange, mesh.patch_start), row_sums, doubts, closed=closed)
-        seen = solve_exchange(solution, exchange, sums, doubt, closed=closed)
-        apart = _told_apart(seen, area, closed) ** 2
-        for rows in _row_blocks(n):
-            variance = (spread[rows] / area[rows, None]) ** 2 @ apart
-            square[0] += area[rows] @ variance / area.sum()
+            summed = exchange.summed(mesh.patch_start)
+            solve_exchange(coarse, summed, row_sums, doubts, closed=closed, closed_to=closed_to)
+        seen = solve_exchange(solution, exchange, sums, doubt, closed=closed, closed_to=closed_to)
+        square[0] += spread @ _told_apart(seen, area, closed) ** 2 / area.sum()
     solution.state_irradiance_error(form_factors=square[0], visibility=square[1])
     record.errors["reciprocity"] = 0.0
     record.counters.add(shots=n)

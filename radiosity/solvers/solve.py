@@ -12,6 +12,7 @@ import numpy as np
 
 from radiosity.form_factors.bundle import ColumnFinder, LinkSettings, ReceiverBundles
 from radiosity.form_factors.directional import DirectionalBundles
+from radiosity.form_factors.matrix import SOLVE_ENTRY
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
 from radiosity.solvers.direct import solve_direct, solve_matrix
 from radiosity.solvers.incident import incident_irradiance
@@ -79,7 +80,8 @@ DEFAULTS: SolveOptions = {
 
 # Bytes an element costs while a mesh is made and solved, beside its bands.
 _ELEMENT_BYTES = 3000
-_MATRIX_BYTES = 40.0  # an entry of a full matrix, with its error and what is needed while they are found
+DIRECT_ENTRY = 40.0
+"""Bytes of an entry of a matrix that is found column by column."""
 _FEWER = "ask for fewer elements or a larger max_edge"
 
 
@@ -141,17 +143,17 @@ def _forecast(scene: Scene, elements: int | None, max_edge: float | None, method
     count = float(elements) if elements is not None else float(forecast_elements(scene, max_edge or math.inf))
     require_memory(count * (_ELEMENT_BYTES + 64 * scene.bands), f"a mesh of {count:.3g} elements", _FEWER)
     if method in FULL:
-        require_matrix_memory(count)
+        require_matrix_memory(count, SOLVE_ENTRY if method == "matrix" else DIRECT_ENTRY)
 
 
-def require_matrix_memory(count: float) -> None:
-    """Refuse a full matrix of form factors that cannot fit in memory."""
-    require_memory(_MATRIX_BYTES * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", _FEWER)
+def require_matrix_memory(count: float, entry: float = SOLVE_ENTRY) -> None:
+    """Refuse a full matrix of form factors, of so many bytes an ``entry``, that cannot fit in memory."""
+    require_memory(entry * count**2, f"a matrix of {count:.3g} x {count:.3g} form factors", _FEWER)
 
 
 def most_matrix_elements() -> int:
     """Most elements whose matrix fits in memory, with some to spare."""
-    return int(math.sqrt(0.8 * available_bytes() / _MATRIX_BYTES))
+    return int(math.sqrt(0.8 * available_bytes() / SOLVE_ENTRY))
 
 
 def _note_materials(geometry: Geometry, record: RunRecord) -> None:
