@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from radiosity.accuracy import solve, surface_points
 from radiosity.form_factors.bundle import LinkSettings, ReceiverBundles
+from radiosity.report.compiling import Compiling
 from radiosity.report.metrics import relative_rms
 from radiosity.sensors import Gatherer
 from radiosity.solvers.solution import Solution
@@ -116,30 +117,6 @@ class _Stopped(BaseException):
     """Raised where the time of a run is up; as Ctrl-C, no handler of errors takes it."""
 
 
-class _Compiling(event.Listener):
-    """Seconds in which kernels are compiled, on the clock and of the processor: the first run on a machine has many."""
-
-    def __init__(self) -> None:
-        self.wall = self.processor = 0.0
-        self._depth = 0
-        self._since = (0.0, 0.0)
-
-    def on_start(self, event: event.Event) -> None:
-        if self._depth == 0:
-            self._since = time.perf_counter(), time.process_time()
-        self._depth += 1
-
-    def on_end(self, event: event.Event) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            self.wall += time.perf_counter() - self._since[0]
-            self.processor += time.process_time() - self._since[1]
-
-    def so_far(self) -> float:
-        """Processor seconds, those of a kernel under way with them."""
-        return self.processor + (time.process_time() - self._since[1] if self._depth else 0.0)
-
-
 class _Purse:
     """Processor seconds that are left."""
 
@@ -163,12 +140,12 @@ class _Purse:
 
 
 @contextmanager
-def _at_most(seconds: float, purse: _Purse) -> Iterator[_Compiling]:
+def _at_most(seconds: float, purse: _Purse) -> Iterator[Compiling]:
     """Stop the block once it took that much processor time, compiling left out: the purse gets that back.
 
     In a thread other than the main one nothing is stopped.
     """
-    compiling = _Compiling()
+    compiling = Compiling()
     limited = math.isfinite(seconds) and threading.current_thread() is threading.main_thread()
     end = time.process_time() + seconds
     over = False

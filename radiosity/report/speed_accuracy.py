@@ -22,14 +22,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numba.core import event
 
+from radiosity.report.compiling import Compiling
 from radiosity.report.metrics import at_error, frontier, relative_rms, slope
 from radiosity.report.techniques import Problem, Reference, Technique
+from radiosity.rivals import TITLES
 from workbench.errors import InputError
 from workbench.record import write_text_atomically
 from workbench.scene.model import Scene
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
@@ -51,6 +55,8 @@ MORE = 5
 SAME = 1.05
 """Medians that differ by less are the same: where things lie in memory moves the seconds of a process by so much
 (T. Mytkowicz, A. Diwan, M. Hauswirth, P. F. Sweeney 2009), which no repeat within the process shows."""
+MOST_COMPILED = 3
+"""Times that one run is tried until nothing is compiled in it; what is compiled once is kept."""
 LONE = 1.25
 """The same of a single run, whose spread nobody knows."""
 _TESTS = ("polygon_tests", "box_tests", "bounding_sphere_tests", "sphere_tests")
@@ -250,11 +256,11 @@ def measure(
     """Run techniques over their settings, interleaved.
 
     Every technique runs its coarsest setting once in vain first: kernels are compiled and loaded
-    then.  In each round all settings of all techniques run one after the other, from the second round
-    on in an order of chance (the same each time), so that a machine that slows down slows all alike and
-    none always follows the same other.  Settings whose runs are short go on for :data:`MORE` times as many
-    rounds: their spread is that of the machine's interruptions.  Garbage is collected before each run
-    and not during it.
+    then.  A run in which others had to be compiled is thrown away and done again.  In each round all settings of
+    all techniques run one after the other, from the second round on in an order of chance (the same each time), so
+    that a machine that slows down slows all alike and none always follows the same other.  Settings whose runs are
+    short go on for :data:`MORE` times as many rounds: their spread is that of the machine's interruptions.  Garbage
+    is collected before each run and not during it.
 
     Parameters
     ----------
@@ -323,12 +329,22 @@ def measure(
         name, value, seed, repeat = place
         technique, prepare = made[name]
         try:
-            gc.collect()
-            gc.disable()
-            with _Memory() as memory:
-                used, start = _processor_seconds(), time.perf_counter()
-                answer = technique.ask(value, seed)
-                seconds, used = time.perf_counter() - start, _processor_seconds() - used
+            for _ in range(MOST_COMPILED):
+                gc.collect()
+                gc.disable()
+                compiling = Compiling()
+                with _Memory() as memory, event.install_listener("numba:compile", compiling):
+                    used, start = _processor_seconds(), time.perf_counter()
+                    answer = technique.ask(value, seed)
+                    seconds, used = time.perf_counter() - start, _processor_seconds() - used
+                gc.enable()
+                if compiling.wall == 0.0:
+                    break
+                notes.append(
+                    f"{name} at {technique.key} {value:g}: a run of {seconds:.2g} s was thrown away, in which kernels"
+                    f" were compiled for {compiling.wall:.2g} s"
+                )
+                report(notes[-1])
             error, doubt = relative_rms(problem.judged(answer.values), judge, variance)
         except WorkbenchError as problem_found:
             notes.append(f"{name} at {technique.key} {value:g} is left out: {problem_found}")
@@ -555,6 +571,8 @@ def draw_chart(
     have a grey ring.  Bars reach over the spread of the runs and over one standard error.  Below
     ``floor`` nothing can be told; ``noise`` is that of the reference, which has been taken off.
     """
+    from matplotlib.container import ErrorbarContainer
+
     figure.set_size_inches(9.5, 6.2)
     axes = figure.subplots()
     axes.set_xscale("log")
@@ -579,12 +597,17 @@ def draw_chart(
             [p.seconds for p in tied], [height(p) for p in tied], ls="", marker="o", ms=17, mfc="none", mec="0.75",
             mew=2.5, zorder=1, label="as fast as the frontier, within the spread of the runs",
         )  # fmt: skip
+    told: list[tuple[str, float, float, str]] = []
     for number, method in enumerate(dict.fromkeys(p.method for p in shown)):
         mine = [p for p in shown if p.method == method]
         kind = mine[0].kind
         # What chooses itself changes its ways between settings, and follows no power.
         steep = None if kind == "auto" else slope([p.seconds for p in mine], [p.error for p in mine])
-        name = method + {"ours": "", "auto": " (chooses itself)", "rival": " (rival)"}[kind]
+        name = {
+            "ours": method,
+            "auto": f"{method} (chooses itself; numbers: error asked)",
+            "rival": f"{TITLES.get(method, method)} (rival)",
+        }[kind]
         text = name if steep is None else f"{name}, slope {steep:.2f}"
         colour = _COLOURS[number % len(_COLOURS)]
         marker = "*" if kind == "auto" else _MARKERS[number % len(_MARKERS)]
@@ -600,13 +623,7 @@ def draw_chart(
             zorder=4 if kind == "auto" else 3,
         )  # fmt: skip
         if kind == "auto":
-            for p in mine:
-                if p.error == 0 and p is not mine[0]:
-                    continue  # they lie on top of each other
-                axes.annotate(
-                    f"{p.value:g}", (p.seconds, height(p)), xytext=(7, 7), textcoords="offset points", fontsize=8,
-                    color=colour,
-                )  # fmt: skip
+            told += [(f"{p.value:g}", p.seconds, height(p), colour) for p in mine]
     if floor > 0:
         low, high = axes.get_ylim()
         axes.set_ylim(min(low, 0.5 * floor), high)
@@ -631,7 +648,48 @@ def draw_chart(
     axes.set_ylabel(label)
     axes.set_title(title, fontsize=11)
     axes.grid(alpha=0.25, which="major")
-    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    handles, texts = axes.get_legend_handles_labels()
+    axes.legend(
+        # Markers without bars, which would hide their form.
+        [handle[0] if isinstance(handle, ErrorbarContainer) else handle for handle in handles], texts,
+        fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False,
+    )  # fmt: skip
+    _tell(figure, axes, told, [(p.seconds, height(p)) for p in shown])
+
+
+def _tell(
+    figure: Figure, axes: Axes, told: Sequence[tuple[str, float, float, str]], marked: Sequence[tuple[float, float]]
+) -> None:  # fmt: skip
+    """Write texts beside points (x, y), in a colour, none over another or over a marked point.
+
+    Points that lie on top of each other are told together, those for which there is no room not at all.
+    """
+    if not told:
+        return
+    figure.draw_without_rendering()  # the axes take their place
+    scale = figure.dpi / 72.0
+    at, marks = (axes.transData.transform(points) / scale for points in ([(x, y) for _, x, y, _ in told], marked))
+    groups: list[list[int]] = []
+    for i in range(len(told)):
+        near = next((g for g in groups if math.dist(at[g[0]], at[i]) < 4.0 and told[g[0]][3] == told[i][3]), None)
+        if near is None:
+            groups.append([i])
+        else:
+            near.append(i)
+    taken = [(x - 5.0, y - 5.0, x + 5.0, y + 5.0) for x, y in marks]
+    taken.append((axes.bbox.x1 / scale, 0.0, math.inf, math.inf))  # the legend
+    for group in groups:
+        text, (x, y) = ", ".join(told[i][0] for i in group), at[group[0]]
+        width, height = 5.5 * len(text), 8.0
+        for right, up in ((7, 5), (7, -13), (-7 - width, 5), (-7 - width, -13), (8, -4), (-8 - width, -4)):
+            box = (x + right, y + up, x + right + width, y + up + height)
+            if not any(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken):
+                taken.append(box)
+                axes.annotate(
+                    text, told[group[0]][1:3], xytext=(right, up), textcoords="offset points", fontsize=8,
+                    color=told[group[0]][3],
+                )  # fmt: skip
+                break
 
 
 def _plain_ticks(axis: Axis, low: float, high: float) -> None:

@@ -18,7 +18,7 @@ from radiosity.rivals.base import QUESTIONS, Rival
 from workbench.errors import OptionError
 from workbench.scene.model import Scene
 
-__all__ = ["QUESTIONS", "RIVALS", "Rival", "absent", "open_rival"]
+__all__ = ["QUESTIONS", "RIVALS", "TITLES", "Rival", "absent", "open_rival"]
 
 RIVALS = {
     "mitsuba": ("radiosity.rivals.mitsuba", "Mitsuba", "mitsuba"),
@@ -27,6 +27,13 @@ RIVALS = {
     "trimesh": ("radiosity.rivals.trimesh_ray", "TrimeshRay", "trimesh"),
 }
 """Module, class and needed package of each rival, by its name on the command line."""
+TITLES = {
+    "mitsuba": "Mitsuba 3, paths",
+    "pyviewfactor": "pyViewFactor, contours of a mesh",
+    "radiance": "Radiance, rtrace uncached",
+    "trimesh": "trimesh.ray, NumPy and Embree",
+}
+"""What charts call them."""
 
 
 @cache

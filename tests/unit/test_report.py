@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from numba import njit
 
 from radiosity.report.metrics import at_error, frontier, relative_rms, resolution, slope
 from radiosity.report.page import html_page
@@ -136,6 +137,29 @@ def test_records_grow_and_are_not_run_again(tmp_path):
     # A record from the beginning has the same counts and errors.
     fresh, _ = measure(Coin(), judge, [("halving", None), ("exact", [4.0])], seeds=(0, 1), repeats=2)
     assert [(r.place, r.rays, r.error) for r in fresh] == [(r.place, r.rays, r.error) for r in more]
+
+
+def test_a_run_that_compiled_kernels_is_done_again():
+    """The finest setting needs a kernel that no other had: its first run is no measurement."""
+
+    class Compiled(Coin):
+        def technique(self, name):
+            plain = super().technique(name)
+            kernel = njit(lambda x: x + 1.0)  # of its own: nothing is compiled before it is called
+
+            def ask(value, seed):
+                if value == 16:
+                    kernel(value)
+                return plain.ask(value, seed)
+
+            return replace(plain, ask=ask)
+
+    coin = Compiled()
+    runs, notes = measure(coin, Reference("truth", np.ones((4, 1))), [("halving", None)], repeats=1)
+    assert [run.value for run in runs] == [1.0, 4.0, 16.0]
+    assert coin.calls == [("halving", value, 0) for value in (1.0, 1.0, 4.0, 16.0, 16.0)]
+    assert max(run.seconds for run in runs) < 0.05  # compiling takes longer
+    assert len(notes) == 1 and notes[0].startswith("halving at samples 16: a run") and "compiled" in notes[0]
 
 
 def test_what_fails_is_left_out_with_its_reason():
