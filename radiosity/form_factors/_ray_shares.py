@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from radiosity.form_factors._sampling import place_on_pieces, stream
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
+from workbench.geometry.flat import Geometry
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -65,20 +64,57 @@ def _pair_rays(
 
 
 @njit(nogil=True, cache=True)
-def _gather(starts, weights, blocked, sums):
+def _gather(starts, weights, passed, sums):
     """Add each pair's seen, whole and squared weights to ``sums`` (pairs, 3)."""
     for p in range(starts.shape[0] - 1):
         for k in range(starts[p], starts[p + 1]):
             w = weights[k]
             sums[p, 1] += w
             sums[p, 2] += w * w
-            if blocked[k] != 0:
-                sums[p, 0] += w
+            sums[p, 0] += w * passed[k]
 
 
-def _trace(pairs: IntArray, begin: IntArray, counts: IntArray, seed: int, pieces, tracer, sums: FloatArray) -> int:
+class Sight:
+    """What arrives along rays between points: opaque polygons block it, panes dim it.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    """
+
+    def __init__(self, geometry: Geometry) -> None:
+        clear = geometry.polygon_transmittance > 0.0
+        self._transmittance = geometry.polygon_transmittance[clear]
+        self._panes = EmbreeAccelerator(geometry.part(clear)) if clear.any() else None
+        self.tracer = EmbreeAccelerator(geometry.part(~clear) if clear.any() else geometry)
+        self.offset = max(tracer.offset for tracer in (self.tracer, self._panes) if tracer is not None)
+
+    def passed(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> FloatArray:
+        """Share (n,) that arrives along rays (n, 3) in the tracer's unit coordinates, from end to end."""
+        blocked = self.tracer.blocked_raw(origins, directions, np.ones(len(origins), dtype=np.float32))
+        passed = (blocked != 0).astype(np.float64)
+        if self._panes is None:
+            return passed
+        centre, unit = self.tracer.frame
+        rows = np.flatnonzero(passed)
+        start, rest = origins[rows] / unit + centre, directions[rows].astype(np.float64) / unit
+        while len(rows):
+            hits = self._panes.closest_hit(start, rest, far=1.0)
+            met = hits.polygon >= 0
+            rows, start, rest = rows[met], start[met], rest[met]
+            passed[rows] *= self._transmittance[hits.polygon[met]]
+            # On from just beyond the pane.
+            step = hits.t[met] + self.offset / np.linalg.norm(rest, axis=1)
+            on = step < 1.0
+            rows, start, rest = rows[on], (start + step[:, None] * rest)[on], (rest * (1.0 - step[:, None]))[on]
+        return passed
+
+
+def _trace(
+    pairs: IntArray, begin: IntArray, counts: IntArray, seed: int, pieces, sight: Sight, sums: FloatArray
+) -> int:
     """Trace the asked rays of every pair, block by block."""
-    centre, scale = tracer.frame
+    centre, scale = sight.tracer.frame
     ends = np.cumsum(counts)
     first = 0
     traced = 0
@@ -92,10 +128,9 @@ def _trace(pairs: IntArray, begin: IntArray, counts: IntArray, seed: int, pieces
         weights = np.empty(most)
         used = _pair_rays(
             pairs[block], begin[block], counts[block], seed, pieces.corners, pieces.start, pieces.normal, pieces.area,
-            tracer.offset, centre, scale, starts, origins, directions, weights,
+            sight.offset, centre, scale, starts, origins, directions, weights,
         )  # fmt: skip
-        blocked = tracer.blocked_raw(origins[:used], directions[:used], np.ones(used, dtype=np.float32))
-        _gather(starts, weights, blocked, sums[block])
+        _gather(starts, weights, sight.passed(origins[:used], directions[:used]), sums[block])
         traced += used
         first = last
     return traced
@@ -112,7 +147,7 @@ def _shares(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def ray_shares(
-    pairs: IntArray, goals: FloatArray, seed: int, pieces, tracer: EmbreeAccelerator, most: int = MOST_RAYS
+    pairs: IntArray, goals: FloatArray, seed: int, pieces, sight: Sight, most: int = MOST_RAYS
 ) -> tuple[FloatArray, FloatArray, int]:
     """Visible share of each pair of pieces by rays, its standard error, and the rays traced.
 
@@ -124,24 +159,22 @@ def ray_shares(
     seed : int
     pieces
         Corners, start, normal and area of the pieces.
-    tracer : EmbreeAccelerator
+    sight : Sight
     most : int
         Most rays of a pair.
     """
     sums = np.zeros((len(pairs), 3))
     counts = np.full(len(pairs), FIRST_RAYS, dtype=np.int64)
     begin = np.zeros(len(pairs), dtype=np.int64)
-    traced = _trace(pairs, begin, counts, seed, pieces, tracer, sums)
+    traced = _trace(pairs, begin, counts, seed, pieces, sight, sums)
     _, doubt = _shares(sums)
     wanted = np.minimum((doubt / goals) ** 2 * FIRST_RAYS, most)
     more = np.flatnonzero(wanted > 1.5 * FIRST_RAYS)
     if len(more):
         extra = np.ceil(wanted[more]).astype(np.int64) - FIRST_RAYS
         part = sums[more]
-        traced += _trace(
-            np.ascontiguousarray(pairs[more]), np.full(len(more), math.floor(FIRST_RAYS)), extra, seed, pieces, tracer,
-            part,
-        )  # fmt: skip
+        begin = np.full(len(more), FIRST_RAYS, dtype=np.int64)
+        traced += _trace(np.ascontiguousarray(pairs[more]), begin, extra, seed, pieces, sight, part)
         sums[more] = part
     share, doubt = _shares(sums)
     return share, doubt, traced

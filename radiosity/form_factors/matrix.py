@@ -23,12 +23,18 @@ from numpy.typing import NDArray
 
 from radiosity.form_factors import _pairs, _stripes
 from radiosity.form_factors._covered import covered_pieces
-from radiosity.form_factors._ray_shares import MOST_RAYS, ray_shares
+from radiosity.form_factors._ray_shares import MOST_RAYS, Sight, ray_shares
 from radiosity.form_factors._refine import REFINING_RAYS, cell_workspace
 from radiosity.form_factors._symmetric import SymmetricMatrix
-from radiosity.form_factors.hemisphere_rays import COUNTS, RANDOMISATIONS, HemisphereRays, predicted_rays, ray_exchanges
+from radiosity.form_factors.hemisphere_rays import (
+    COUNTS,
+    FIRST_RAYS,
+    RANDOMISATIONS,
+    HemisphereRays,
+    RayExchanges,
+    least_seconds,
+)
 from radiosity.patches import PatchMesh, build_mesh, forecast_elements
-from workbench.accel.embree import EmbreeAccelerator
 from workbench.arrays import as_count, as_fraction
 from workbench.culling.shaft import MAX_SHAFT_PLANES
 from workbench.culling.tally import add_tally, new_tally
@@ -73,10 +79,15 @@ CLOSED_TO = 1e-10
 PAIR_SECONDS = 2e-7
 """Of a pair of pieces at an error of 0.02, in processor seconds: measured on closed rooms of 2,000 and 8,000 triangles,
 which are clear for the most part, so that it is seldom less.  It grows with the inverse root of the error."""
-RAY_SECONDS = 1e-6
-"""Of a ray of a row, with all that is done for it."""
-RAY_START = 0.1
-"""Seconds that rays take however few they are: Embree's tree, and polygons put into rows."""
+FEW_SECONDS, PLANE_SECONDS, CLUTTER_SECONDS = 4e-7, 5e-6, 2.5e-6
+"""Of a pair of few pieces at first sight, what each plane a piece adds to it, and to refine it to 0.01 for each plane
+and plane a piece: measured on the office, rooms (also in 100 to 400 triangles), Cornell boxes: within a factor of 3."""
+MOST_PLANES = 150
+"""Planes beyond which more do not make a pair dearer: rays see past them."""
+ENGINE_SECONDS, PIECE_SECONDS = 1.5e-3, 2e-5
+"""To prepare pairs, and of it each piece."""
+WORTH_A_LOOK = 5e-3
+"""Seconds that pairs must be expected to take for rays to be tried: below, the answer of pairs is the better one."""
 
 _CENTROID = (np.full((1, 3), 1.0 / 3.0), np.ones(1))
 _TRIANGLE_3 = (np.array([[4.0, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6.0, np.full(3, 1.0 / 3.0))
@@ -533,7 +544,7 @@ class _Engine:
         goals = self.care.share_error * (1.0 + self.care.floor * smaller / whole)
         goals = np.minimum(goals, threshold / (whole * (importance[i] + importance[j])))
         most = MOST_RAYS if threshold == math.inf else REFINING_RAYS
-        share, doubt, traced = ray_shares(pairs, goals, self.seed, self.pieces, self.tracer(), most)
+        share, doubt, traced = ray_shares(pairs, goals, self.seed, self.pieces, self.sight(), most)
         out[i - base, j] = whole * share
         spread[i - base, j] = spread[i - base, j] * share + whole * doubt
         return traced
@@ -554,13 +565,13 @@ class _Engine:
         return found
 
     @cached_property
-    def _tracer(self) -> EmbreeAccelerator:
-        return EmbreeAccelerator(self.geometry)
+    def _sight(self) -> Sight:
+        return Sight(self.geometry)
 
-    def tracer(self) -> EmbreeAccelerator:
-        """Embree, built when the first thread needs it."""
+    def sight(self) -> Sight:
+        """What rays pass, built when the first thread needs it."""
         with self._building:
-            return self._tracer
+            return self._sight
 
 
 def close_rows(exchange: Matrix, wanted: FloatArray, to: float = CLOSED_TO) -> FloatArray:
@@ -817,9 +828,11 @@ def view_factors(
     exactly at the points of a rule (facets of one plane block as one polygon); only the rest gets rays.
     Then the pairs that make the stated error larger than ``error``, and only those, are refined: both ends are
     halved where the pair's error is made.
-    Where rows are far fewer than polygons (``by="surface"`` of a scene of many) and the error allows, rays from each
-    row take less than its pairs of polygons: see :mod:`radiosity.form_factors.hemisphere_rays`.  The record says which
-    was taken (``method``) and the processor seconds predicted of both.
+    Where that is expected to take long, a few rays from each row tell how many would be needed instead, and the
+    cheaper way is taken (rays where rows are few for the polygons, or the scene is cluttered and the error coarse): see
+    :mod:`radiosity.form_factors.hemisphere_rays`.  The record says which (``method``) and the processor seconds
+    predicted of both.  An entry that no ray has met has an error of three hits, a bound; the stated row error counts
+    all of these together and may be less than their sum.
     In a scene declared closed rows are closed by a symmetric scaling, see :func:`close_rows`; a row on which
     something stands and that lacks more than 1 % (and than four times its error) is covered and keeps what it has.
     """
@@ -861,18 +874,28 @@ def view_factors(
             raise InputError(
                 f"{where}: found {names[flat]} with no area; leave out polygons whose corners lie in a line"
             )
-    method, predicted = _choice(mesh, geometry, len(names), error)
-    record.results["method"] = method
-    record.results["predicted_seconds"] = predicted
     what = f"a matrix of {len(names)} x {len(names)} view factors"
-    if method == "hemisphere rays":
-        with record.stage("prepare"):
+    predicted = {"pairs": _pair_seconds(mesh, geometry, len(names), error)}
+    record.results["predicted_seconds"] = predicted
+    # Rays end at panes.
+    clear = not geometry.polygon_transmittance.any()
+    rays = None
+    if clear and predicted["pairs"] > max(WORTH_A_LOOK, least_seconds(len(names), len(mesh.piece_element), error)):
+        with record.stage("prepare"), _threads(threads, len(mesh.piece_element)) as each:
             require_memory(_ray_forecast(len(names), len(mesh.piece_element)), what, advice)
-            source = HemisphereRays(mesh, row_of)
+            rays = RayExchanges(HemisphereRays(mesh, row_of), areas, seed, record.counters)
+            rays.add(FIRST_RAYS, each)
+            predicted["hemisphere rays"] = rays.seconds(error)
+            if predicted["hemisphere rays"] > predicted["pairs"]:
+                rays = None
+    record.results["method"] = "pairs" if rays is None else "hemisphere rays"
+    surplus = 0.0
+    if rays is not None:
         with record.stage("exchange areas"), _threads(threads, len(mesh.piece_element)) as each:
-            exchange, spread, rays = ray_exchanges(source, areas, error, seed, each, record.counters, progress)
-            exchange, spread = _smaller(exchange, spread)
-        record.results["rays_a_row"] = rays
+            rays.reach(error, each, progress)
+            exchange, spread = _smaller(*rays.matrices())
+        record.results["rays_a_row"] = rays.rays
+        surplus = rays.surplus
 
         def touched(rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
             engine = _Engine(mesh, geometry, _Care.for_error(error, mesh.element_count), seed)
@@ -882,7 +905,8 @@ def view_factors(
     else:
         with record.stage("prepare"):
             engine = _Engine(mesh, geometry, _Care.for_error(error, mesh.element_count), seed)
-            require_memory(_forecast(len(names), _facing_share(engine.pieces, seed), threads), what, advice)
+            facing = _facing_share(engine.pieces, seed) if engine.pieces.count > LARGE else 1.0
+            require_memory(_forecast(len(names), facing, threads), what, advice)
         piece_row = row_of[engine.pieces.owner]
         with record.stage("exchange areas"):
             exchange, spread = _all_exchanges(engine, piece_row, areas, threads, record, progress, error)
@@ -892,25 +916,29 @@ def view_factors(
 
         occluders = engine.occluders.count
     with record.stage("close"):
-        found = _finished(scene, exchange, spread, areas, names, record, touched, threads)
+        found = _finished(scene, exchange, spread, areas, names, record, touched, threads, surplus)
     record.results.update(rows=len(names), pieces=len(mesh.piece_element), occluders=occluders, sparse=found.sparse)
     return found
 
 
-def _choice(mesh: _Elements, geometry: Geometry, rows: int, error: float) -> tuple[str, dict[str, float]]:
-    """``pairs`` or ``hemisphere rays``, whichever is predicted to take less, and the processor seconds of both.
+def _pair_seconds(mesh: _Elements, geometry: Geometry, rows: int, error: float) -> float:
+    """Processor seconds that pairs are expected to take.
 
-    Rays pay where rows are far fewer than pieces: their number goes with the square of the rows over the error.
+    Pairs of few large polygons are refined behind most of the scene's planes, those of planes in many pieces seldom;
+    errors of many pieces in one row cancel.
     """
     pieces = len(mesh.piece_element)
-    predicted = {
-        "pairs": 0.5 * pieces**2 * PAIR_SECONDS * math.sqrt(0.02 / error),
-        "hemisphere rays": RAY_START + predicted_rays(rows, error) * RAY_SECONDS,
-    }
-    # Rays end at panes.
-    clear = not geometry.polygon_transmittance.any()
-    method = "hemisphere rays" if clear and predicted["hemisphere rays"] < predicted["pairs"] else "pairs"
-    return method, predicted
+    pairs = 0.5 * pieces**2
+    prepare = ENGINE_SECONDS + PIECE_SECONDS * pieces
+    if pieces >= LARGE:
+        return prepare + pairs * PAIR_SECONDS * math.sqrt(0.02 / error)
+    normal = geometry.polygon_normal
+    corner = geometry.corners[geometry.piece_start[geometry.polygon_piece_start[:-1]]] - geometry.bounds[0]
+    plane = np.column_stack([normal, np.einsum("ij,ij->i", normal, corner) / geometry.size])
+    plane *= np.where(plane[np.arange(len(plane)), np.abs(normal).argmax(axis=1)] < 0, -1.0, 1.0)[:, None]
+    planes = min(len(np.unique(np.round(1e6 * plane + 0.237), axis=0)), MOST_PLANES)
+    refine = CLUTTER_SECONDS * planes * (0.01 / error) ** 0.9 * rows / pieces
+    return prepare + pairs * (FEW_SECONDS + planes / pieces * (PLANE_SECONDS + refine))
 
 
 def _ray_forecast(rows: int, pieces: int) -> float:
@@ -1212,8 +1240,12 @@ def _finished(
     record: RunRecord,
     touched: Callable[[NDArray[np.bool_]], NDArray[np.bool_]],
     threads: int,
+    surplus: float,
 ) -> ViewFactors:
-    """Close the rows of an enclosure, divide by the areas, and say how good it is."""
+    """Close the rows of an enclosure, divide by the areas, and say how good it is.
+
+    ``surplus`` is by how much the sum of all errors is known to be too large, as a mean over the rows.
+    """
     n = len(areas)
     if isinstance(exchange, np.ndarray):
         start, column = np.arange(n + 1, dtype=np.int64) * n, np.empty(0, dtype=np.int32)
@@ -1229,7 +1261,7 @@ def _finished(
             list(pool(lambda block: work(*block), _blocks(n)))
 
         each(lambda first, last: _row_sums(first, last, start, data, errors, areas, sums, stated, doubt))
-        record.errors["stated_row_error_as_found"] = float(stated.mean())
+        record.errors["stated_row_error_as_found"] = float(stated.mean()) - surplus
         if scene.closed:
             covered = 1.0 - sums > np.maximum(4.0 * doubt, COVERED)
             if covered.any():
@@ -1245,7 +1277,7 @@ def _finished(
         row_sum={"min": float(closed_sums.min()), "mean": float(closed_sums.mean()), "max": float(closed_sums.max())},
         closure_correction=correction,
         reciprocity=back,
-        stated_row_error=float(stated.mean()),
+        stated_row_error=float(stated.mean()) - surplus,
     )
     return ViewFactors(exchange, spread, areas, names, sums, correction, back, record)
 

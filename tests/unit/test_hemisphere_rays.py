@@ -20,7 +20,7 @@ def errors_of(found):
 @pytest.fixture
 def by_rays(monkeypatch):
     """Rays however small the scene."""
-    monkeypatch.setattr(matrix, "PAIR_SECONDS", np.inf)
+    monkeypatch.setattr(matrix, "_pair_seconds", lambda *_: np.inf)
 
     def ask(scene, **options):
         found = radiosity.view_factors(scene, **options)
@@ -63,16 +63,42 @@ def test_many_polygons_by_surface_get_rays_and_their_closed_form():
     assert abs(np.mean(z)) < 4 / np.sqrt(12) and 0.3 < np.sqrt(np.mean(np.square(z))) < 2
 
 
-def test_small_scenes_and_rows_as_many_as_polygons_keep_their_pairs():
+def test_the_cheaper_way_is_taken():
     small = radiosity.view_factors(
         polygon_scene(FACING[0].face(0)[0] * 50, [[0, 0, 1], [0, 1, 1], [1, 1, 1]]), error=0.1
     )
-    assert small.record.results["method"] == "pairs"
+    # So few pairs are not worth a look at rays.
+    assert (
+        small.record.results["method"] == "pairs" and "hemisphere rays" not in small.record.results["predicted_seconds"]
+    )
     room = closed_room(0.8)
-    for by, error in (("patch", 0.1), ("patch", 1e-3), ("surface", 1e-3)):
-        mesh = matrix.Geometry.from_scene(room)
-        rows = mesh.polygon_count if by == "patch" else len(room.surfaces)
-        assert matrix._choice(matrix._Elements.of_polygons(mesh), mesh, rows, error)[0] == "pairs"
+    for by, error, way in (("patch", 0.1, "pairs"), ("surface", 0.1, "hemisphere rays"), ("surface", 1e-3, "pairs")):
+        record = radiosity.view_factors(room, by=by, error=error).record
+        predicted = record.results["predicted_seconds"]
+        assert record.results["method"] == way
+        assert predicted[way] <= min(predicted.values())
+    # Nor are rays tried where they are hopeless.
+    assert record.counters["rays"] == 0 and len(predicted) == 1
+
+
+def test_cluttered_scenes_get_rays_for_a_coarse_error():
+    # Many large polygons at random: their pairs see each other past most others.
+    rng = np.random.default_rng(3)
+    rings = []
+    for _ in range(120):
+        along, across, middle = rng.normal(size=3), rng.normal(size=3), rng.uniform(-1, 1, 3)
+        rings.append(middle + 0.3 * np.array([along, across, -along - across]))
+    scene = polygon_scene(*rings)
+    coarse = radiosity.view_factors(scene, error=0.1)
+    assert coarse.record.results["method"] == "hemisphere rays"
+    assert coarse.record.errors["stated_row_error"] <= 0.1
+    fine = radiosity.view_factors(scene, error=0.01)
+    off = np.abs(coarse.dense() - fine.dense()).sum(axis=1).mean()
+    stated = coarse.record.errors["stated_row_error"]
+    # A sum over 14,280 entries hardly scatters: it is known as well as its estimate is right.
+    assert stated / 2 < off < 1.2 * stated
+    # Entries have bounds where no ray met a pair; together these are far more than can be missing.
+    assert errors_of(coarse).sum(axis=1).mean() > stated
 
 
 def test_more_rays_for_a_smaller_error(by_rays):
@@ -97,7 +123,7 @@ def test_a_closed_room_with_obstruction_against_pairs(by_rays, monkeypatch, by):
         assert np.abs(factor.sum(axis=1) - 1).max() < 1e-9 and found.closure_correction > 0
         assert np.abs(found.row_sums - 1).max() < 0.05
         with monkeypatch.context() as plain:
-            plain.setattr(matrix, "PAIR_SECONDS", 0.0)
+            plain.setattr(matrix, "_pair_seconds", lambda *_: 0.0)
             exact = radiosity.view_factors(room, by=by, error=1e-4, workers=2)
         assert exact.record.results["method"] == "pairs"
         off = factor - exact.dense()

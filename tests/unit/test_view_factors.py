@@ -135,6 +135,26 @@ def test_long_candidate_lists_get_rays(monkeypatch):
     assert len(z) > 50 and np.sqrt((z**2).mean()) < 1.5
 
 
+def test_panes_dim_rays_too(monkeypatch):
+    # Two squares with two panes and a small blocker between: by exact cuts, and by rays where nothing may be cut.
+    low, high = truth_squares()
+    opaque = diffuse("wall", 0.5)
+    pane = type(opaque)(**{**opaque.__dict__, "transmittance": np.full_like(opaque.reflectance, 0.5)})
+    surfaces = [Surface.from_polygons(f"s{i}", opaque, [ring]) for i, ring in enumerate((low, high))]
+    for height, material, size in ((0.3, pane, 9.0), (0.5, opaque, 0.4), (0.7, pane, 0.6)):
+        ring = (low - [0.5, 0.5, 0]) * size + [0.5, 0.5, height]
+        surfaces.append(Surface.from_polygons(f"at {height}", material, [ring]))
+    scene = Scene("panes", tuple(surfaces), bands=1)
+    exact = radiosity.view_factors(scene, error=1e-5)
+    clear = radiosity.view_factors(Scene("clear", tuple(surfaces[:2]), bands=1), error=1e-5)
+    assert 0.1 < exact.dense()[0, 1] / clear.dense()[0, 1] < 0.4
+    monkeypatch.setattr(matrix._pairs, "MAX_CUT", 0)
+    monkeypatch.setattr(matrix, "REFINEMENTS", 0)
+    found = radiosity.view_factors(scene, error=1e-3)
+    assert found.record.counters["rays"] > 0
+    assert abs(found.dense() - exact.dense())[0, 1] < 4 * errors_of(found)[0, 1] < 0.02
+
+
 @each_truth("occ/L-room/")
 def test_l_room(name):
     import workbench

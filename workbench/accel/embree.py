@@ -293,3 +293,14 @@ class EmbreeAccelerator:
             return np.full(len(origins), NO_POLYGON, dtype=np.int64)
         triangle = np.asarray(self._scene.run(origins, directions, query="INTERSECT"))
         return np.where(triangle >= 0, self._polygon[triangle], NO_POLYGON)
+
+    def first_raw(self, origins: NDArray, directions: NDArray) -> NDArray[np.int64]:
+        """As :meth:`nearest_raw`; doubtful hits are looked at again in double precision, as by :meth:`closest_hit`."""
+        if len(self._polygon) == 0:
+            return np.full(len(origins), NO_POLYGON, dtype=np.int64)
+        limit = np.full(len(origins), 1e30)
+        triangle, reach, doubt = self._first(origins, directions, limit)
+        if doubt is not None:
+            begin, along = origins.astype(np.float64), directions.astype(np.float64)
+            _look_again(doubt, begin, along, limit, self._triangles, self._boxes, triangle, reach)
+        return np.where(triangle >= 0, self._polygon[triangle], NO_POLYGON)

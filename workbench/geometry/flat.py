@@ -153,6 +153,25 @@ class Geometry:
         """Fan triangles (t, 3, 3) of all pieces, and the piece (t,) of each."""
         return fan_triangles(self.corners, self.piece_start)
 
+    def part(self, keep: NDArray[np.bool_]) -> Geometry:
+        """The polygons (q,) that are to be kept, in their order."""
+        pieces = keep[self.piece_polygon]
+        sizes = np.diff(self.piece_start)
+        number = np.cumsum(keep) - 1
+        return Geometry(
+            corners=np.ascontiguousarray(self.corners[np.repeat(pieces, sizes)]),
+            piece_start=np.concatenate([[0], np.cumsum(sizes[pieces])]).astype(np.int64),
+            piece_normal=self.piece_normal[pieces],
+            piece_polygon=number[self.piece_polygon[pieces]],
+            polygon_area=self.polygon_area[keep],
+            polygon_normal=self.polygon_normal[keep],
+            polygon_surface=self.polygon_surface[keep],
+            polygon_face=self.polygon_face[keep],
+            surface_material=self.surface_material,
+            surface_name=self.surface_name,
+            polygon_transmittance=self.polygon_transmittance[keep],
+        )
+
     @classmethod
     def from_scene(cls, scene: Scene) -> Geometry:
         """Flatten a scene.
