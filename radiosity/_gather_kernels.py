@@ -16,30 +16,6 @@ RUNS = 4
 
 
 @njit(nogil=True, cache=True)
-def net_bits(count):
-    """The first ``count`` points of the Sobol sequence in two dimensions, as 32-bit binary fractions.
-
-    Any aligned block of a power of two of them is a (0, m, 2)-net.  The first coordinate is the
-    reversed index (van der Corput), the second comes from the Pascal matrix (I. M. Sobol, 1967).
-    """
-    out = np.zeros((count, 2), dtype=np.uint32)
-    for k in range(count):
-        x = y = np.uint32(0)
-        direction = np.uint32(0x80000000)
-        place = np.uint32(0x80000000)
-        rest = k
-        while rest:
-            if rest & 1:
-                x ^= place
-                y ^= direction
-            rest >>= 1
-            place >>= np.uint32(1)
-            direction ^= direction >> np.uint32(1)
-        out[k, 0], out[k, 1] = x, y
-    return out
-
-
-@njit(nogil=True, cache=True)
 def gather_rays(
     points, normals, rows, bits, first, last, count, seed, offset, centre, scale, origins, directions, owner, run,
 ):  # fmt: skip

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radiosity._exact_gather import exact_gather
-from radiosity._gather_kernels import RUNS, collect_hits, gather_rays, net_bits
+from radiosity._gather_kernels import RUNS, collect_hits, gather_rays
 from radiosity.element_lookup import ElementLookup, bounding_rectangle, element_gradients
 from radiosity.patches import PatchMesh
 from radiosity.solvers.solution import Solution
@@ -29,6 +29,7 @@ from workbench.counters import Counters
 from workbench.culling.tally import BOX, CHECK, CLOSED, CUT, PIECES, add_tally, new_tally
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
+from workbench.sampling.sequences import sobol_bits
 from workbench.scene.model import Scene
 from workbench.shadow.lights import Sender, SphereLight, lights_of_scene
 from workbench.shadow.occlusion import ROUNDING, Shader
@@ -552,7 +553,7 @@ class Gatherer(DirectLight):
         tracer, geometry, mesh = self.shader.tracer, self.geometry, self.solution.mesh
         centre, scale = tracer.frame
         law = bundle.sky.law if bundle.sky is not None else np.zeros(12)
-        bits = net_bits(max(count for *_, count in blocks))
+        bits = sobol_bits(max(count for *_, count in blocks))
         coarse = bundle.deep * self._coarse if bundle.deep else np.zeros(mesh.element_count)
 
         def work(task: tuple[IntArray, int, int]) -> tuple[int, int, _Close]:

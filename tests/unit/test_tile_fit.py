@@ -112,7 +112,7 @@ def held_to_exact(floor, error):
     return np.sqrt(np.mean(gap**2)) / mean, np.sqrt(np.mean(doubt**2)) / mean, found
 
 
-@pytest.mark.parametrize("error", [0.03, 0.003])
+@pytest.mark.parametrize("error", [0.015, 0.003])
 def test_fits_meet_the_asked_error_and_state_their_own(floor, error):
     made, stated, found = held_to_exact(floor, error)
     assert found.counters["fitted_points"] > len(found.state) / 4

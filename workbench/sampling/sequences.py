@@ -132,16 +132,34 @@ def r2(count: int, rng: Seed) -> FloatArray:
     return np.minimum((shift + np.arange(count)[:, None] * step) % 1.0, _BELOW_ONE)
 
 
+@njit(nogil=True, cache=True)
+def _sobol_bits(count):
+    out = np.zeros((count, 2), dtype=np.uint32)
+    for k in range(count):
+        x = y = np.uint32(0)
+        direction = np.uint32(0x80000000)
+        place = np.uint32(0x80000000)
+        rest = k
+        while rest:
+            if rest & 1:
+                x ^= place
+                y ^= direction
+            rest >>= 1
+            place >>= np.uint32(1)
+            direction ^= direction >> np.uint32(1)
+        out[k, 0], out[k, 1] = x, y
+    return out
+
+
 def sobol_bits(count: int) -> NDArray[np.uint32]:
     """The first ``count`` points of the plain Sobol sequence, (count, 2), as 32-bit binary fractions.
 
-    Source: scipy.stats.qmc (direction numbers of S. Joe and F. Y. Kuo, 2008).
+    Any aligned block of a power of two of them is a (0, m, 2)-net.  The first coordinate is the reversed index (van
+    der Corput), the second comes from the Pascal matrix (I. M. Sobol, 1967).
     """
-    from scipy.stats import qmc  # half a second of import, for this alone
-
     _checked(count, 0)
-    plain = qmc.Sobol(2, scramble=False, bits=32).random_base2(max(count - 1, 0).bit_length())
-    return (plain[:count] * 2.0**32).astype(np.uint32)
+    bits: NDArray[np.uint32] = _sobol_bits(count)
+    return bits
 
 
 @njit(nogil=True, cache=True)

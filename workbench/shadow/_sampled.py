@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from workbench.accel.voxel_grid import VoxelGrid
 from workbench.counters import Counters
 from workbench.shadow.lights import LinearLight, PolygonLight, Sender
-from workbench.shadow.rays import lattice, sender_samples, weighted_shares
+from workbench.shadow.rays import sender_samples, unit_samples, weighted_shares
 from workbench.shadow.woo import (
     LightOcclusion,
     adaptive_area_occlusion,
@@ -87,7 +87,7 @@ def _in_blocks(
     step = max(1, _RAYS // bundle.count)
     for first in range(0, count, step):
         rows = slice(first, min(first + step, count))
-        weights, through = ask(rows, lattice(bundle.index[rows], bundle.count, bundle.seed))
+        weights, through = ask(rows, unit_samples(bundle.index[rows], bundle.count, bundle.seed))
         rays = weights.shape[1]
         weighted_shares(
             0, len(weights), rays, np.ascontiguousarray(weights).ravel(), np.ascontiguousarray(through).ravel(),

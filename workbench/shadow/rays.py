@@ -14,18 +14,18 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
+from workbench.sampling.sequences import hashed, owen_scramble, sobol_bits
 
-__all__ = ["NOISE", "lattice", "sender_samples", "shift", "visible_shares", "weighted_shares"]
+__all__ = ["NOISE", "sender_samples", "unit_samples", "visible_shares", "weighted_shares"]
 
 FloatArray = NDArray[np.float64]
 
-# Generalised golden ratio in two dimensions: a rank-1 lattice sequence with low discrepancy.
-_G2 = 1.3247179572447460
-
-NOISE = 0.64
+NOISE = 0.48
 """Measured on a tessellated torus: K rays leave an error of NOISE K^-3/4 of a visible share."""
 SHARED_RAYS = 8192
 """More rays than these are spread over threads."""
+NET_GAIN = 0.75
+"""Four runs of a net complete each other: the whole is better than their spread says by this (measured)."""
 PRIOR = 4.0
 """Degrees of freedom for which that measurement counts in the standard error of a point."""
 
@@ -49,44 +49,38 @@ def sender_samples(ring: FloatArray, unit: FloatArray) -> FloatArray:
 
 
 @njit(nogil=True, cache=True)
-def shift(index, seed):
-    """SplitMix64 of a point's number: a shift (u, v) of the lattice of its own, whatever the blocks."""
-    h = np.uint64(index) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed) * np.uint64(0x94D049BB133111EB)
-    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    h ^= h >> np.uint64(31)
-    u = np.float64(h & np.uint64(0xFFFFFF)) / 16777216.0
-    return u, np.float64((h >> np.uint64(24)) & np.uint64(0xFFFFFF)) / 16777216.0
+def _scrambled(bits, own, out):
+    for axis in range(2):
+        digits = np.uint32((own >> np.uint64(32 * axis)) & np.uint64(0xFFFFFFFF))
+        for k in range(out.shape[0]):
+            # The middle of the 2^-32 that the 32 digits leave open.
+            out[k, axis] = (np.float64(owen_scramble(bits[k, axis], digits)) + 0.5) * 2.0**-32
 
 
 @njit(nogil=True, cache=True)
-def _fill_lattice(index, seed, out):
+def _fill(bits, index, seed, out):
     for row in range(out.shape[0]):
-        u, v = shift(index[row], seed)
-        for k in range(out.shape[1]):
-            u += 1.0 / _G2
-            v += 1.0 / (_G2 * _G2)
-            if u >= 1.0:
-                u -= 1.0
-            if v >= 1.0:
-                v -= 1.0
-            out[row, k, 0], out[row, k, 1] = u, v
+        _scrambled(bits, hashed(index[row], seed), out[row])
 
 
-def lattice(index: NDArray[np.int64], count: int, seed: int) -> FloatArray:
-    """The unit-square samples (n, count, 2) that :func:`visible_shares` uses at points of these numbers."""
+def unit_samples(index: NDArray[np.int64], count: int, seed: int) -> FloatArray:
+    """The unit-square samples (n, count, 2) that :func:`visible_shares` uses at points of these numbers.
+
+    Sobol points, Owen-scrambled for each point by its number and ``seed``, whatever the blocks: past
+    an edge they leave a quarter less error than a shifted lattice, and runs of 4, 16, ... of them are nets, too.
+    """
     out = np.empty((len(index), count, 2))
-    _fill_lattice(np.ascontiguousarray(index), seed, out)
+    _fill(sobol_bits(count), np.ascontiguousarray(index), seed, out)
     return out
 
 
 @njit(nogil=True, cache=True)
 def _make_rays(
-    points, normals, index, first, last, count, seed, ring, edges, sender_normal, offset, centre, scale, origins,
+    points, normals, index, first, last, bits, seed, ring, edges, sender_normal, offset, centre, scale, origins,
     directions, weights,
 ):  # fmt: skip
-    """``count`` rays a point toward the fan triangles ``ring`` (t, 3, 3) with cumulated areas ``edges``."""
-    g1, g2 = 1.0 / _G2, 1.0 / (_G2 * _G2)
+    """A ray a point for each of ``bits`` toward the fan triangles ``ring`` (t, 3, 3) of cumulated areas ``edges``."""
+    unit = np.empty((bits.shape[0], 2))
     mx, my, mz = sender_normal[0], sender_normal[1], sender_normal[2]
     parallelogram = ring.shape[0] == 2
     for axis in range(3):
@@ -95,18 +89,13 @@ def _make_rays(
             parallelogram = False
     row = 0
     for i in range(first, last):
-        u, v = shift(index[i], seed)
+        _scrambled(bits, hashed(index[i], seed), unit)
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         sx, sy, sz = px + offset * nx, py + offset * ny, pz + offset * nz
         ox, oy, oz = (sx - centre[0]) * scale, (sy - centre[1]) * scale, (sz - centre[2]) * scale
-        for _ in range(count):
-            u += g1
-            v += g2
-            if u >= 1.0:
-                u -= 1.0
-            if v >= 1.0:
-                v -= 1.0
+        for sample in range(bits.shape[0]):
+            u, v = unit[sample, 0], unit[sample, 1]
             if parallelogram:
                 a, b = u, v
                 k = 0
@@ -140,7 +129,7 @@ def weighted_shares(first, last, count, weights, through, share, doubt):
 
     ``through`` is 0 where a ray is blocked and 1 (Embree: -1) where it arrives, or what a pane lets
     pass.  The error is pooled: the spread of four runs of the rays, which has three degrees of
-    freedom and would by itself be far too small at some points, and what K points of the lattice
+    freedom and would by itself be far too small at some points, and what K points of the net
     leave of a share on the average, :data:`NOISE` K^-3/4, less near 0 and 1.  Rays of unequal weight, as to a
     light that the horizon cuts, count as fewer: (sum w)^2 / sum w^2 (L. Kish, Survey Sampling, 1965).
     """
@@ -171,7 +160,7 @@ def weighted_shares(first, last, count, weights, through, share, doubt):
             spread = 0.0
             for run in range(runs):
                 spread += (seen[run] - mean * total[run]) ** 2
-            spread *= runs / (runs - 1.0) / (whole * whole)
+            spread *= NET_GAIN * NET_GAIN * runs / (runs - 1.0) / (whole * whole)
             square = (PRIOR * square + (runs - 1.0) * spread) / (PRIOR + runs - 1.0)
         # K rays that agree leave room for a blocker, or a gap, of about half a ray's width.
         doubt[i] = max(math.sqrt(square), 0.5 / rays)
@@ -212,6 +201,7 @@ def visible_shares(
     area = np.linalg.norm(np.cross(ring[:, 1] - ring[:, 0], ring[:, 2] - ring[:, 0]), axis=1)
     edges = np.concatenate([[0.0], np.cumsum(area) / area.sum()])
     centre, scale = tracer.frame
+    bits = sobol_bits(count)
     step = max(1, BLOCK_RAYS // count)
     if len(points) * count > SHARED_RAYS:
         step = min(step, -(-len(points) // workers))
@@ -222,7 +212,7 @@ def visible_shares(
         origins, directions = np.empty((rows, 3), np.float32), np.empty((rows, 3), np.float32)
         weights = np.empty(rows)
         _make_rays(
-            points, normals, index, first, last, count, seed, ring, edges, sender_normal, tracer.offset, centre,
+            points, normals, index, first, last, bits, seed, ring, edges, sender_normal, tracer.offset, centre,
             scale, origins, directions, weights,
         )  # fmt: skip
         blocked = tracer.blocked_raw(origins, directions, np.ones(rows, np.float32))

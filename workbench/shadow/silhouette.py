@@ -30,9 +30,9 @@ from workbench.culling.shaft import MAX_SHAFT_PLANES, tile_shaft
 from workbench.culling.tally import CLEAR, COMPLEX, DARK, EDGES, EMPTY, FITTED, LINES, SHAFT
 from workbench.geometry.flat import Geometry
 from workbench.geometry.planes import clip_by_plane
+from workbench.sampling.sequences import hashed
 from workbench.shadow._settle import STATE_CLEAR, STATE_COMPLEX, STATE_DARK, STATE_SAMPLED
 from workbench.shadow._tile_fit import NODE_GAP, NODES, TERMS, cubic_at, cut_runs, fit_cubic, pick_nodes, quarter
-from workbench.shadow.rays import shift
 from workbench.shadow.tiles import DIFFERENT
 
 __all__ = [
@@ -944,9 +944,10 @@ def line_tiles(chosen, tiles, sender, table, frame, tree, slack, fewest, most, a
                 i = node_row[k] if fitted else rows[a + k]
                 if state[i] == STATE_COMPLEX:
                     nx, ny, nz = _turned(axes, normals[i, 0], normals[i, 1], normals[i, 2])
+                    start = np.float64(hashed(index[i], seed) >> np.uint64(11)) * 2.0**-53  # of its lines, its own
                     seen, hidden, error = _look(
                         places[i - first, 0], places[i - first, 1], places[i - first, 2], nx, ny, nz, own[i],
-                        shift(index[i], seed)[0], node_lines if fitted else fewest, most,
+                        start, node_lines if fitted else fewest, most,
                         NODE_NOISE * allowed if fitted else allowed, ring, group, sizes, frame, table,
                         loose_here[:close], various, scratch, tally,
                     )  # fmt: skip
