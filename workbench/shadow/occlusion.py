@@ -823,7 +823,7 @@ class Shader:
             tracer = self.tracer
             share = visible_shares(
                 tracer, tiles.points[rows], tiles.normals[rows], tiles.order[rows], [ring], normal, count=count,
-                seed=task.seed, workers=self.workers,
+                seed=task.seed, workers=self.workers, spread=self.spread,
             )  # fmt: skip
             task.counters.add(rays=len(rows) * count)
             return share

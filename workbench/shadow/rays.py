@@ -7,7 +7,7 @@ form: the sender's irradiance is never estimated from the bare kernel.
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numba import njit
@@ -166,6 +166,11 @@ def weighted_shares(first, last, count, weights, through, share, doubt):
         doubt[i] = max(math.sqrt(square), 0.5 / rays)
 
 
+def _in_turn(work: Callable[[int], None], tasks: Sequence[int]) -> None:
+    for task in tasks:
+        work(task)
+
+
 def visible_shares(
     tracer: EmbreeAccelerator,
     points: FloatArray,
@@ -177,6 +182,7 @@ def visible_shares(
     count: int,
     seed: int = 0,
     workers: int = 1,
+    spread: Callable[[Callable[[int], None], Sequence[int]], object] = _in_turn,
 ) -> tuple[FloatArray, FloatArray]:
     """Visible share of a sender from each point by ``count`` rays.
 
@@ -189,7 +195,9 @@ def visible_shares(
     pieces : list of (k, 3) float
         Convex pieces of the sender.
     sender_normal : (3,) float
-    count, seed, workers : int
+    count, seed : int
+    workers, spread
+        How many threads there are, and what shares out blocks to them.
 
     Returns
     -------
@@ -218,12 +226,6 @@ def visible_shares(
         blocked = tracer.blocked_raw(origins, directions, np.ones(rows, np.float32))
         weighted_shares(first, last, count, weights, blocked, share, doubt)
 
-    starts = range(0, len(points), step)
-    if workers > 1 and len(starts) > 1:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(block, starts))
-    else:
-        for first in starts:
-            block(first)
+    spread(block, range(0, len(points), step))
     tracer.counters.add(rays=len(points) * count)
     return share, doubt
