@@ -28,10 +28,16 @@ IntArray = NDArray[np.int64]
 
 POINTS = 4
 """Points an element at which lights without surface and the sky are evaluated."""
-FEW_ELEMENTS, MORE_POINTS = 256, 16
-"""Points an element for the sky in meshes of few elements, which are large, where these points differ:"""
-UNEVEN = 0.2
-"""Deviation of the light at the points of an element from which there are more, over the wanted error."""
+MORE_POINTS, MOST_POINTS = 16, 1024
+"""Points an element that tell how uneven the light is; and most for the sky on elements where these points differ:"""
+FEW_ELEMENTS, SKY_POINTS = 256, 4096
+"""Elements of a mesh up to which these get more at first; and points in all of a later round, which go to the worst."""
+UNEVEN, MEAN_SHARE = 0.07, 0.5
+"""Share of the wanted error that the mean of an element may be off by, from which there are more points at first; and
+the same of the root mean square over the elements, from which there are further ones."""
+SPREAD_POWER = 0.75
+"""Power of the number of points with which the error of an element's mean falls, from their standard deviation on: the
+points are a lattice, and what they see has edges."""
 
 ENDS = 4.0
 """Rays toward a lamp end so many times the tracer's offset before it."""
@@ -250,7 +256,7 @@ def incident_irradiance(
         Over the scene's geometry.
     error : float
         Wanted error of the sky's light, relative to the mean of all that arrives: where the light at a few points of
-        an element differs by little of it, these are enough.
+        an element differs by little of it, these are enough.  Large elements get more.
     sky_rays : int
         Cosine-distributed rays a point of an element toward the sky, where its occluders are too many
         to be cut.
@@ -274,13 +280,24 @@ def incident_irradiance(
             out[first:last] += _light_means(light, mesh, first, last, seed, tracer)[:, None] * light.power
     if sky is not None:
         shader = shader if shader is not None else Shader(Geometry.from_scene(scene))
-        everything = np.arange(mesh.element_count)
-        found = _from_sky(mesh, everything, POINTS, sky_rays, seed, sky, shader)
-        mean = found.mean(axis=1)
-        if mesh.element_count <= FEW_ELEMENTS:
-            level = mesh.element_area @ (out + mean) / mesh.element_area.sum()
-            uneven = np.flatnonzero((found.std(axis=1) > UNEVEN * error * level).any(axis=1))
-            mean[uneven] = _from_sky(mesh, uneven, MORE_POINTS, sky_rays, seed, sky, shader).mean(axis=1)
+        rows, count = np.arange(mesh.element_count), POINTS
+        found = _from_sky(mesh, rows, count, sky_rays, seed, sky, shader)
+        mean, doubt = found.mean(axis=1), found.std(axis=1) / count**SPREAD_POWER
+        level = mesh.element_area @ (out + mean) / mesh.element_area.sum()
+        share = mesh.element_area / mesh.element_area.sum()
+        while count < MOST_POINTS:
+            off = np.max(doubt / np.where(level > 0.0, level, np.inf), axis=1)
+            if count == POINTS and len(off) <= FEW_ELEMENTS:
+                rows = np.flatnonzero(off > UNEVEN * error)
+            elif share @ off**2 > (MEAN_SHARE * error) ** 2:
+                worst = np.argsort(-share * off**2, kind="stable")[: SKY_POINTS // (4 * count)]
+                rows = np.sort(worst[off[worst] > MEAN_SHARE * error])
+            else:
+                break
+            count *= 4
+            if len(rows):
+                found = _from_sky(mesh, rows, count, sky_rays, seed, sky, shader)
+                mean[rows], doubt[rows] = found.mean(axis=1), found.std(axis=1) / count**SPREAD_POWER
         out += mean
     return out
 

@@ -16,7 +16,7 @@ from radiosity.solvers.solve import begin, solve_by_matrix
 from workbench.errors import InputError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.scene.library import box_surface, diffuse, unit_cube
-from workbench.scene.model import Scene, Surface
+from workbench.scene.model import Scene, Sky, Surface
 from workbench.shadow.occlusion import Shader
 
 CASES = {case.name: case for case in accuracy_cases()}
@@ -153,6 +153,27 @@ def test_a_box_that_stands_on_a_glowing_floor_takes_no_light_from_it(error):
     assert 0 < under.sum() < 15
     found = solution.irradiance(points[~under], normals[~under], own_polygon=polygon[~under], error=0.2 * error)
     assert np.sqrt(((found.irradiance - 1.0) ** 2).mean()) < 0.5 * error
+
+
+@pytest.mark.parametrize("method", ["matrix", "hierarchical"])
+@pytest.mark.parametrize(("side", "depth"), [(1.0, 1.0), (4.0, 1.0), (1.0, 5.0)])
+def test_a_black_pit_under_the_sky_gets_what_its_opening_sends(side, depth, method):
+    """One element a face is enough for points, and the means of these elements are right, too.
+
+    Of a uniform sky the floor gets F from floor to opening (Howell C-11), the four walls share the rest.
+    """
+    pit = box_surface("pit", diffuse("black", 0.0), [0, 0, 0], [side, side, depth], inward=True, omit=["+z"])
+    sky = Sky("uniform", np.zeros(1), horizontal_irradiance=np.ones(1))
+    solution = radiosity.solve(Scene("pit", (pit,), bands=1, sky=sky), error=0.01, method=method)
+    mesh = solution.mesh
+    floor = mesh.element_normal[:, 2] > 0.5
+    arrives = mesh.element_area * solution.element_irradiance[:, 0]
+    opening = [[0, 0, depth], [0, side, depth], [side, side, depth], [side, 0, depth]]
+    down = radiosity.form_factor([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]], opening)
+    mean = side**2 / (side**2 + 4 * side * depth)
+    assert mesh.element_count < 20
+    assert arrives[floor].sum() / side**2 == pytest.approx(down, abs=0.01 * mean)
+    assert arrives.sum() / mesh.element_area.sum() == pytest.approx(mean, rel=0.01)
 
 
 def test_the_error_can_be_asked_for_where_it_matters():
