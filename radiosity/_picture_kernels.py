@@ -181,42 +181,39 @@ def bends(pixel, sheet, bright, start, width, turn, cut):
     The mean over a pixel of what is smooth differs from its middle by a 24th of the second difference, and of a
     step by half of it.  ``start[p]:start[p + 1]`` are the fragments of pixel p.
     """
-    pixels = start.shape[0] - 1
+    height = (start.shape[0] - 1) // width
     for i in range(pixel.shape[0]):
-        cut[i] = False
-        row = np.uint64(pixel[i]) // np.uint64(width)  # signed divisions take several times as long
-        column = pixel[i] - np.int64(row) * width
+        here, wanted, found = bright[i], sheet[i], False
+        row = np.int64(np.uint64(pixel[i]) // np.uint64(width))  # signed divisions take several times as long
+        column = pixel[i] - row * width
         for axis in range(2):
-            stride = 1 if axis == 0 else width
-            before, after = -1, -1
-            if axis == 1 or column > 0:
-                before = _beside(pixel[i] - stride, sheet[i], sheet, start, pixels)
-            if axis == 1 or column < width - 1:
-                after = _beside(pixel[i] + stride, sheet[i], sheet, start, pixels)
-            here = bright[i]
+            stride, low, high = (1, column, width - 1 - column) if axis == 0 else (width, row, height - 1 - row)
+            before = _on_sheet(pixel[i] - stride, wanted, sheet, start) if low > 0 else -1
+            after = _on_sheet(pixel[i] + stride, wanted, sheet, start) if high > 0 else -1
             if before >= 0 and after >= 0:
                 off, most = abs(2.0 * here - bright[before] - bright[after]), max(bright[before], bright[after])
             elif before >= 0 or after >= 0:
                 one = max(before, after)
                 off, most = abs(here - bright[one]), bright[one]
                 beyond = -1
-                way = pixel[one] - pixel[i]
-                if axis == 1 or 0 <= column + 2 * way < width:
-                    beyond = _beside(pixel[i] + 2 * way, sheet[i], sheet, start, pixels)
+                if before >= 0 and low > 1:
+                    beyond = _on_sheet(pixel[i] - 2 * stride, wanted, sheet, start)
+                elif after >= 0 and high > 1:
+                    beyond = _on_sheet(pixel[i] + 2 * stride, wanted, sheet, start)
                 if beyond >= 0:  # what the next two foretell
                     off = min(off, abs(here - 2.0 * bright[one] + bright[beyond]))
             else:
                 continue
-            cut[i] = cut[i] or off > turn * max(most, here)
+            found = found or off > turn * max(most, here)
+        cut[i] = found
 
 
 @njit(nogil=True, cache=True)
-def _beside(place, wanted, sheet, start, pixels):
+def _on_sheet(place, wanted, sheet, start):
     """The fragment of a pixel on a sheet, -1 for none."""
-    if 0 <= place < pixels:
-        for j in range(start[place], start[place + 1]):
-            if sheet[j] == wanted:
-                return j
+    for j in range(start[place], start[place + 1]):
+        if sheet[j] == wanted:
+            return j
     return -1
 
 
