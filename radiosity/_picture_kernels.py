@@ -9,15 +9,18 @@ from numba import njit
 
 RIDGE = 1e-3
 """Share of the sum of weights that holds slopes back where samples do not tell them."""
+THROUGH = 1e-4
+"""Square of the distance, as a share of the furthest neighbour's, at which a sharp sample no longer outweighs others."""
 REACH = 1.5
 """Values of a fit stay within the samples' range widened by this share of it on either side."""
 
 
 @njit(nogil=True, cache=True)
-def local_fits(place, neighbour, distance, limit, sample_place, values, out):
+def local_fits(place, neighbour, distance, limit, sample_place, values, sharp, out):
     """Fit a plane to the nearest samples about each place, and read it there.
 
-    Moving least squares: weights (1 - (d/h)^2)^2, h the distance of the furthest neighbour.
+    Moving least squares: weights (1 - (d/h)^2)^2, h the distance of the furthest neighbour.  Where the nearest sample
+    is sharp they are divided by (d/h)^2, about: the fit goes through the samples (Lancaster and Salkauskas 1981).
 
     Parameters
     ----------
@@ -29,11 +32,13 @@ def local_fits(place, neighbour, distance, limit, sample_place, values, out):
         Beyond ``limit`` a neighbour lies on another sheet and does not count.
     sample_place : (m, 2) float
     values : (m, bands) float
+    sharp : (m,) bool
     out : (n, bands) float
         NaN where there is no neighbour.
     """
     bands = values.shape[1]
     k = neighbour.shape[1]
+    weight = np.empty(k)
     for i in range(place.shape[0]):
         count = 0
         while count < k and distance[i, count] < limit:
@@ -51,6 +56,9 @@ def local_fits(place, neighbour, distance, limit, sample_place, values, out):
             m = neighbour[i, j]
             r = distance[i, j] / h
             w = (1.0 - r * r) ** 2
+            if sharp[neighbour[i, 0]]:
+                w /= r * r + THROUGH
+            weight[j] = w
             dx, dy = (sample_place[m, 0] - place[i, 0]) / h, (sample_place[m, 1] - place[i, 1]) / h
             s += w
             sx += w * dx
@@ -63,8 +71,7 @@ def local_fits(place, neighbour, distance, limit, sample_place, values, out):
             low, high = np.inf, -np.inf
             for j in range(count):
                 m = neighbour[i, j]
-                r = distance[i, j] / h
-                mean += (1.0 - r * r) ** 2 * values[m, band]
+                mean += weight[j] * values[m, band]
                 low, high = min(low, values[m, band]), max(high, values[m, band])
             mean /= s
             # About the weighted mean: slopes from the centred moments, held back by a ridge.
@@ -74,9 +81,7 @@ def local_fits(place, neighbour, distance, limit, sample_place, values, out):
             cxy = sxy - s * ax * ay
             bx = by = 0.0
             for j in range(count):
-                m = neighbour[i, j]
-                r = distance[i, j] / h
-                w = (1.0 - r * r) ** 2
+                m, w = neighbour[i, j], weight[j]
                 dx, dy = (sample_place[m, 0] - place[i, 0]) / h - ax, (sample_place[m, 1] - place[i, 1]) / h - ay
                 bx += w * dx * (values[m, band] - mean)
                 by += w * dy * (values[m, band] - mean)
@@ -175,15 +180,16 @@ def _steps(one, i, two, j, step):
 
 
 @njit(nogil=True, cache=True)
-def bends(pixel, sheet, bright, start, width, turn, cut):
-    """Mark fragments, sorted by pixel, where brightness bends or steps from pixel to pixel of their sheet.
+def bends(pixel, sheet, bright, start, width, bent):
+    """By what share brightness bends or steps from pixel to pixel of a sheet, of the brighter ones (``bent`` (n,)).
 
     The mean over a pixel of what is smooth differs from its middle by a 24th of the second difference, and of a
     step by half of it.  ``start[p]:start[p + 1]`` are the fragments of pixel p.
     """
     height = (start.shape[0] - 1) // width
     for i in range(pixel.shape[0]):
-        here, wanted, found = bright[i], sheet[i], False
+        here, wanted = bright[i], sheet[i]
+        bent[i] = 0.0
         row = np.int64(np.uint64(pixel[i]) // np.uint64(width))  # signed divisions take several times as long
         column = pixel[i] - row * width
         for axis in range(2):
@@ -200,12 +206,13 @@ def bends(pixel, sheet, bright, start, width, turn, cut):
                     beyond = _on_sheet(pixel[i] - 2 * stride, wanted, sheet, start)
                 elif after >= 0 and high > 1:
                     beyond = _on_sheet(pixel[i] + 2 * stride, wanted, sheet, start)
-                if beyond >= 0:  # what the next two foretell
+                if beyond >= 0 and here > 0.0:  # what the next two foretell, but that light ends somewhere
                     off = min(off, abs(here - 2.0 * bright[one] + bright[beyond]))
             else:
                 continue
-            found = found or off > turn * max(most, here)
-        cut[i] = found
+            most = max(most, here)
+            if most > 0.0:
+                bent[i] = max(bent[i], off / most)
 
 
 @njit(nogil=True, cache=True)

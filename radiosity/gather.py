@@ -88,6 +88,15 @@ PILOT_RAYS = (16, 128)
 """Rays of a bundle before it is known how many are needed: as many as 0.03 of error needs, within these."""
 NODE_ERROR = 1.0
 """Standard error of a node, as a share of the picture's error: a fit averages over a few nodes."""
+INSIDE_TURN = 12.0
+"""Second difference of all light between pixels, relative to what the pixel shows and as a multiple of the error, from
+which indirect light is gathered at several places inside the pixel."""
+INSIDE_SPREAD = 0.5
+"""Standard deviation inside a pixel, as a share of that difference, by which these places are counted."""
+INSIDE_PLACES = (8, 32)
+"""Least and most of them."""
+SHARP = 0.5
+"""A node speaks for itself where it differs from the fit by more than this share of the error, and its standard error."""
 NOISE = 2.5
 """Standard errors of a node by which it may differ from what was foretold without being uneven."""
 TILE = 256
@@ -505,8 +514,8 @@ class _Nodes:
     """Where indirect irradiance was gathered.
 
     ``place`` (n, 3) is the place in the picture and the sheet, ``value`` (n, 2 bands) the irradiance
-    found, first the indirect one, then that from the sky.  A ``sharp`` (n,) node on the finest lattice
-    still disagreed with its neighbours: light changes within a pixel or two, and it speaks for itself.
+    found, first the indirect one, then that from the sky.  A ``sharp`` (n,) node disagrees with what is fitted to it
+    and its neighbours: light changes within a pixel or two, and it speaks for itself.
     """
 
     place: FloatArray
@@ -517,10 +526,16 @@ class _Nodes:
     def none(cls, bands: int) -> _Nodes:
         return cls(np.empty((0, 3)), np.empty((0, 2 * bands)), np.empty(0, dtype=bool))
 
-    def add(self, place: FloatArray, value: FloatArray, sharp: NDArray[np.bool_]) -> None:
+    def add(self, place: FloatArray, value: FloatArray) -> None:
         self.place = np.concatenate([self.place, place])
         self.value = np.concatenate([self.value, value])
-        self.sharp = np.concatenate([self.sharp, sharp])
+        self.sharp = np.concatenate([self.sharp, np.zeros(len(place), dtype=bool)])
+
+    def sharpen(self, first: int, allowed: FloatArray, workers: int) -> None:
+        """Mark nodes from ``first`` on that differ from the fit by more than ``allowed`` (n, 2 bands)."""
+        if first < len(self.place):
+            off = np.abs(self.between(self.place[first:], workers) - self.value[first:])
+            self.sharp[first:] = (off > allowed).any(axis=1)
 
     def near(self, left: float, top: float, right: float, bottom: float) -> _Nodes:
         x, y = self.place[:, 0], self.place[:, 1]
@@ -536,11 +551,8 @@ class _Nodes:
         shape = (len(places), -1)
         kernels.local_fits(
             np.ascontiguousarray(places[:, :2]), neighbour.reshape(shape), distance.reshape(shape), 0.5 * APART,
-            np.ascontiguousarray(self.place[:, :2]), self.value, out,
+            np.ascontiguousarray(self.place[:, :2]), self.value, self.sharp, out,
         )  # fmt: skip
-        nearest = neighbour.reshape(shape)[:, 0]
-        own = self.sharp[nearest] & (distance.reshape(shape)[:, 0] < 1e-6)
-        out[own] = self.value[nearest[own]]
         return out
 
 
@@ -726,13 +738,15 @@ class Picture:
 class _Light:
     """What a tile saw: radiance (pixels, bands) that needs no gather, fragments, and their direct irradiance.
 
-    Where a fragment is ``crowded`` (n,), the sky is not in it, see :class:`radiosity.sensors.Direct`.
+    Where a fragment is ``crowded`` (n,), the sky is not in it, see :class:`radiosity.sensors.Direct`.  What is
+    gathered inside pixels for some fragments is their ``inside``: their rows, and as nodes hold it (k, 2 bands).
     """
 
     radiance: FloatArray
     fragments: _Fragments
     direct: FloatArray
     crowded: NDArray[np.bool_]
+    inside: tuple[IntArray, FloatArray] | None = None
 
     def asks_nodes(self, indirect: bool) -> bool:
         return len(self.fragments) > 0 and (indirect or bool(self.crowded.any()))
@@ -759,7 +773,8 @@ class _Tile:
         straight = self._direct(whole)
         direct = straight.irradiance
         shadow = np.zeros(shape, dtype=bool)
-        shadow[whole.pixel[self._bends(whole, direct)]] = True
+        bent = self._bends(whole.pixel, whole.sheet, direct.sum(axis=1))
+        shadow[whole.pixel[bent > min(TURN * self.options.error, MOST_TURN)]] = True
         cut = shadow.copy()
         cut[edges] = True
         radiance[cut] = 0.0
@@ -784,6 +799,9 @@ class _Tile:
             right, bottom = self.left + self.width + margin, self.top + self.height + margin
             near = nodes.near(self.left - margin, self.top - margin, right, bottom)
             found = near.between(_places(fragments), self.owner.workers)
+            if self.light.inside is not None:
+                rows, value = self.light.inside
+                found[rows] = value
             bands = self.owner.bands
             if self.options.indirect:
                 arriving = arriving + found[:, :bands]
@@ -802,13 +820,27 @@ class _Tile:
         arriving, bands = direct, self.owner.bands
         self.light = _Light(radiance, fragments, direct, crowded)
         if self.light.asks_nodes(self.options.indirect):
-            found, spread, _ = self._bundles(fragments, np.arange(len(fragments)))
+            # Light of each sheet in a pixel at several places; at the fragment alone where none of them lies on it.
+            sheets = int(fragments.sheet.max()) + 1
+            known, first, group = np.unique(
+                fragments.pixel * sheets + fragments.sheet, return_index=True, return_inverse=True
+            )
+            inside = self._inside(pixels, np.full(len(pixels), INSIDE_PLACES[0]))
+            its = inside.pixel * sheets + inside.sheet
+            owner = np.minimum(np.searchsorted(known, its), len(known) - 1)
+            kept = np.flatnonzero(known[owner] == its)
+            alone = np.setdiff1d(np.arange(len(known)), owner[kept])
+            owner = np.concatenate([owner[kept], alone])
+            inside = _Fragments.joined([inside.take(kept), fragments.take(first[alone])])
+            mean, doubt, _ = self._mean_of_groups(inside, owner, direct[first[owner]], len(known))
+            found, spread = mean[group], doubt[group]
             if self.options.indirect:
                 arriving = arriving + found[:, :bands]
             arriving = arriving + np.where(crowded[:, None], found[:, bands:], 0.0)
             for band in range(bands):
-                square = (fragments.gain[:, band] * spread[:, band]) ** 2
-                variance[:, band] = np.bincount(fragments.pixel, square, shape)
+                # Fragments of one group err alike.
+                gain = np.bincount(group, fragments.gain[:, band], len(known))
+                variance[:, band] = np.bincount(known // sheets, (gain * doubt[:, band]) ** 2, shape)
         for band in range(bands):
             radiance[:, band] += np.bincount(fragments.pixel, fragments.gain[:, band] * arriving[:, band], shape)
         return radiance[pixels], variance[pixels]
@@ -921,14 +953,17 @@ class _Tile:
                 place = np.arange(len(rows)) - (ends - more - before - count)[rows]
                 # The first of each pixel's new places: together they are spread over it.
                 wanted = shadow[rows] | (share * (place - count[rows]) < more[rows])
-                self._cast_in(pixels, rows, place, wanted, seen, moments, parts)
+                self._cast_in(pixels, rows, place, wanted, shadow, seen, moments, parts)
             first = last
 
     def _cast_in(
-        self, pixels: IntArray, rows: IntArray, place: IntArray, wanted: NDArray[np.bool_], seen: FloatArray,
-        moments: FloatArray, parts: list[tuple[_Fragments, IntArray, FloatArray, NDArray[np.bool_]]],
+        self, pixels: IntArray, rows: IntArray, place: IntArray, wanted: NDArray[np.bool_],
+        shadow: NDArray[np.bool_], seen: FloatArray, moments: FloatArray, parts: list[tuple[_Fragments, IntArray, FloatArray, NDArray[np.bool_]]],
     ) -> None:  # fmt: skip
-        """Cast rays in pixels ``rows`` at places of the net; direct light is ``wanted`` at some."""
+        """Cast rays in pixels ``rows`` at places of the net; direct light is ``wanted`` at some.
+
+        Marks in ``shadow`` pixels where it has an edge.
+        """
         number = pixels[rows]
         row, column = np.divmod(number, self.width)
         inside = self.owner._places[place]
@@ -951,6 +986,13 @@ class _Tile:
             kernels.light_of_groups(
                 group, places, every.gain, straight.irradiance, found.ray, self.owner.ambient, light, bright
             )
+            if not seen.any() and self.options.error < TRUSTED:
+                # Light that varies over a sheet in a pixel is asked of all its rays.
+                shine, sheet = straight.irradiance.sum(axis=1), group[places]
+                least, most = np.full(many, np.inf), np.zeros(many)
+                np.minimum.at(least, sheet, shine)
+                np.maximum.at(most, sheet, shine)
+                shadow[owner[chosen[most - least > TURN * self.options.error * most]]] = True
             crowded = np.bincount(group[places], straight.crowded, many) > 0
             fragments = every.take(chosen)
             fragments.gain = total
@@ -966,32 +1008,36 @@ class _Tile:
             counters=self.counters,
         )  # fmt: skip
 
-    def _bends(self, fragments: _Fragments, direct: FloatArray) -> NDArray[np.bool_]:
-        """Fragments, sorted by pixel, whose direct light steps or bends toward their neighbours on the same sheet."""
-        cut = np.empty(len(fragments), dtype=bool)
+    def _bends(self, pixel: IntArray, sheet: IntArray, bright: FloatArray) -> FloatArray:
+        """By what share (n,) light bends or steps toward the neighbours on a sheet; rows are sorted by pixel."""
+        bent = np.empty(len(pixel))
         start = np.zeros(self.height * self.width + 1, dtype=np.int64)
-        np.cumsum(np.bincount(fragments.pixel, minlength=len(start) - 1), out=start[1:])
-        bright = direct.sum(axis=1)
-        turn = min(TURN * self.options.error, MOST_TURN)
-        kernels.bends(fragments.pixel, fragments.sheet, bright, start, self.width, turn, cut)
-        return cut
+        np.cumsum(np.bincount(pixel, minlength=len(start) - 1), out=start[1:])
+        kernels.bends(pixel, sheet, np.ascontiguousarray(bright), start, self.width, bent)
+        return bent
 
     # ---- indirect light -------------------------------------------------------------------------
 
-    def _bundles(self, fragments: _Fragments, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What nodes hold (n, 2 bands), its standard error, and harmonic mean distance (n,) of some fragments."""
-        rays, where = self.options.rays, (fragments.points[rows], fragments.normals[rows])
+    def _bundles(
+        self, fragments: _Fragments, rows: IntArray, direct: FloatArray, places: int = 1
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What nodes hold (n, 2 bands), its standard error, and harmonic mean distance (n,) of some fragments.
+
+        ``direct`` (n, bands) is their direct light.  Of so many ``places`` the mean is as good as a node.
+        """
+        where = (fragments.points[rows], fragments.normals[rows])
         gatherer = self.owner.gatherer
         assert isinstance(gatherer, Gatherer)
         # A seed of its own for each call: rows begin at 0 in all, and alike rows would err alike.
         self.calls += 1
         seed = self.owner.seed + ((self.top * self.rays.width + self.left) * 64 + self.calls) * 7919
-        if rays is not None:
-            found = gatherer.indirect(*where, rays=rays, counters=self.counters, seed=seed)
+        if self.options.rays is not None:
+            found = gatherer.indirect(*where, rays=-(-self.options.rays // places), counters=self.counters, seed=seed)
         else:
+            pilot = self.options.pilot_rays if places == 1 else max(2 * self.options.pilot_rays // places, PILOT_RAYS[0])
             found = gatherer.indirect(
-                *where, rays=self.options.pilot_rays, counters=self.counters, error=NODE_ERROR * self.options.error,
-                direct=self.light.direct[rows], seed=seed,
+                *where, rays=pilot, counters=self.counters, error=NODE_ERROR * math.sqrt(places) * self.options.error,
+                direct=direct, seed=seed,
             )  # fmt: skip
         spread = np.concatenate([found.standard_error, found.standard_error], axis=1)
         return np.concatenate([found.indirect, found.sky], axis=1), spread, found.distance
@@ -1003,14 +1049,17 @@ class _Tile:
             return
         everywhere = _places(fragments)
         if not self.options.atomic:
-            value, _, _ = self._bundles(fragments, np.arange(len(fragments)))
+            value, _, _ = self._bundles(fragments, np.arange(len(fragments)), direct)
             self.samples["indirect"] += np.bincount(fragments.pixel, minlength=len(self.samples["indirect"]))
-            nodes.add(everywhere, value, np.ones(len(value), dtype=bool))
+            nodes.add(everywhere, value)
+            nodes.sharp[:] = True
+            self._gather_inside(value)
             return
         margin = 2.0 * self.pitch
         edges = self.left - margin, self.top - margin, self.left + self.width + margin, self.top + self.height + margin
         region = np.ones(len(fragments), dtype=bool)
-        pitch, first = self.pitch, True
+        pitch, first, before = self.pitch, True, len(nodes.place)
+        doubt, least = [np.empty((0, 2 * self.owner.bands))], [np.empty((0, 2 * self.owner.bands))]
         while pitch >= 1 and region.any():
             cell = _cells(everywhere, pitch)
             near = nodes.near(*edges)
@@ -1019,7 +1068,7 @@ class _Tile:
             flagged = np.zeros(0, dtype=np.int64)
             if len(rows):
                 foretold = near.between(everywhere[rows], self.owner.workers)
-                found, spread, distance = self._bundles(fragments, rows)
+                found, spread, distance = self._bundles(fragments, rows, direct[rows])
                 whole = direct[rows] + found[:, : self.owner.bands]
                 total = np.concatenate([whole, whole + found[:, self.owner.bands :]], axis=1)
                 off = np.abs(np.where(np.isfinite(foretold), foretold, found) - found) - NOISE * spread
@@ -1027,12 +1076,71 @@ class _Tile:
                 spacing = SPACING * math.sqrt(max(self.options.error / SPACED_FOR, 1.0))
                 close = pitch * fragments.footprint[rows] > spacing * distance
                 flagged = cell[rows[uneven | close]]
-                sharp: NDArray[np.bool_] = np.logical_and(uneven, pitch == 1)
-                nodes.add(everywhere[rows], found, sharp)
+                nodes.add(everywhere[rows], found)
+                doubt.append(spread)
+                least.append(SHARP * self.options.error * total)
                 self.samples["indirect"] += np.bincount(fragments.pixel[rows], minlength=len(self.samples["indirect"]))
             if not first:  # the second lattice is sampled everywhere, too: it judges the first
                 region = np.isin(cell, (np.unique(flagged)[:, None] + _AROUND).ravel())
             pitch, first = pitch // 2, False
+        nodes.sharpen(before, np.concatenate(least) + np.concatenate(doubt), self.owner.workers)
+        self._gather_inside(nodes.near(*edges).between(everywhere, self.owner.workers))
+
+    def _gather_inside(self, value: FloatArray) -> None:
+        """Gather at several places of the fragments whose light bends inside their pixels.
+
+        ``value`` (n, 2 bands) is what nodes tell of each fragment.
+        """
+        fragments, bands = self.light.fragments, self.owner.bands
+        sheets = int(fragments.sheet.max()) + 1
+        known, first, group = np.unique(
+            fragments.pixel * sheets + fragments.sheet, return_index=True, return_inverse=True
+        )
+        pixel, sheet = fragments.pixel[first], fragments.sheet[first]
+        each = (fragments.gain * (self.light.direct + value[:, :bands] + value[:, bands:])).sum(axis=1)
+        sent, gain = np.bincount(group, each), np.bincount(group, fragments.gain.sum(axis=1))
+        shown = self.light.radiance.sum(axis=1) + np.bincount(fragments.pixel, each, len(self.light.radiance))
+        bent = self._bends(pixel, sheet, sent / np.where(gain > 0.0, gain, 1.0))
+        off = np.minimum(bent, 1.0) * sent / np.where(shown[pixel] > 0.0, shown[pixel], math.inf) / self.options.error
+        chosen = off > INSIDE_TURN
+        if not chosen.any():
+            return
+        count = np.zeros(len(self.light.radiance), dtype=np.int64)
+        wanted = 2 ** np.ceil(4.0 / 3.0 * np.log2(INSIDE_SPREAD * off[chosen])).astype(np.int64)
+        np.maximum.at(count, pixel[chosen], np.clip(wanted, *INSIDE_PLACES))
+        asked = np.flatnonzero(count)
+        found = self._inside(asked, count[asked])
+        its = found.pixel * sheets + found.sheet
+        owner = np.minimum(np.searchsorted(known, its), len(known) - 1)
+        kept = np.flatnonzero((known[owner] == its) & chosen[owner])
+        mean, _, have = self._mean_of_groups(
+            found.take(kept), owner[kept], self.light.direct[first[owner[kept]]], len(known)
+        )
+        rows = np.flatnonzero(have[group])
+        self.light.inside = rows, mean[group[rows]]
+
+    def _inside(self, pixels: IntArray, count: IntArray) -> _Fragments:
+        """Fragments at the first ``count`` places inside some pixels."""
+        number = np.repeat(pixels, count)
+        place = np.arange(len(number)) - np.repeat(np.cumsum(count) - count, count)
+        row, column = np.divmod(number, self.width)
+        inside = self.owner._places[place]
+        keys = self._keys(column, row, place)
+        return self._look(column + inside[:, 0], row + inside[:, 1], number, keys).fragments
+
+    def _mean_of_groups(
+        self, fragments: _Fragments, group: IntArray, direct: FloatArray, many: int
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Indirect light (many, 2 bands) of groups of fragments, as nodes hold it, its standard error, and whether any."""
+        found, spread, _ = self._bundles(fragments, np.arange(len(fragments)), direct, places=INSIDE_PLACES[0])
+        weight = fragments.gain.sum(axis=1)
+        total = np.bincount(group, weight, many)
+        have = total > 0.0
+        share = weight / np.where(have, total, 1.0)[group]
+        mean = np.stack([np.bincount(group, share * each, many) for each in found.T], axis=1)
+        square = np.stack([np.bincount(group, (share * each) ** 2, many) for each in spread.T], axis=1)
+        self.samples["indirect"] += np.bincount(fragments.pixel, minlength=len(self.samples["indirect"]))
+        return mean, np.sqrt(square), have
 
 
 def _variances(moments: FloatArray) -> FloatArray:

@@ -227,10 +227,24 @@ def test_local_fits_meet_planes_exactly_enough(seed):
     values = 30 + samples @ slope
     distance = np.linalg.norm(place[:, None] - samples, axis=2)
     order = np.argsort(distance, axis=1)[:, :10]
-    out = np.empty((4, 1))
-    local_fits(place, order, np.take_along_axis(distance, order, axis=1), 1e6, samples, values[:, None], out)
+    neighbours = place, order, np.take_along_axis(distance, order, axis=1), 1e6, samples
     spread = np.ptp(values[order], axis=1)
-    assert (np.abs(out[:, 0] - (30 + place @ slope)) <= 0.1 * spread + 1e-9).all()
+    for sharp in (False, True):
+        out = np.empty((4, 1))
+        local_fits(*neighbours, values[:, None], np.full(12, sharp), out)
+        assert (np.abs(out[:, 0] - (30 + place @ slope)) <= 0.1 * spread + 1e-9).all()
+
+
+def test_fits_go_through_sharp_samples():
+    rng = np.random.default_rng(3)
+    samples, values = rng.uniform(0, 10, (12, 2)), rng.random((12, 1))
+    distance = np.linalg.norm(samples[:, None] - samples, axis=2)
+    order = np.argsort(distance, axis=1)[:, :10]
+    for sharp, least, most in ((True, 0.0, 5e-3), (False, 0.1, 1.0)):
+        out = np.empty((12, 1))
+        near = np.take_along_axis(distance, order, axis=1)
+        local_fits(samples, order, near, 1e6, samples, values, np.full(12, sharp), out)
+        assert least <= np.abs(out - values).max() <= most
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -299,10 +313,10 @@ def test_steps_and_bends_of_light_are_found_and_slopes_are_not(axis):
 
     def marked(bright, sheet=None, turn=0.1):
         pixel = np.arange(height * width)
-        cut = np.empty(height * width, dtype=bool)
+        bent = np.empty(height * width)
         sheets = np.zeros(height * width, dtype=np.int64) if sheet is None else sheet.ravel()
-        bends(pixel, sheets, np.ravel(bright).astype(float), np.arange(height * width + 1), width, turn, cut)
-        return cut.reshape(height, width)
+        bends(pixel, sheets, np.ravel(bright).astype(float), np.arange(height * width + 1), width, bent)
+        return bent.reshape(height, width) > turn
 
     assert not marked(1.0 + 0.5 * place).any()
     step = marked(np.where(place < 4, 1.0, 1.3))
@@ -347,3 +361,25 @@ def test_pixels_that_are_cut_begin_with_more_rays_where_reflections_are_fuzzy(ex
     cast = tile.samples["camera"]
     cut = (cast > 2) & (tile.fuzzy | np.isinf(exponent))  # more than a corner and the middle
     assert cut.any() and (cast[cut].min() > 32) == np.isfinite(exponent)
+
+
+def test_indirect_light_that_bends_inside_pixels_is_gathered_at_several_places(monkeypatch):
+    # On the floor under a wide shelf light falls off within a pixel or two.  Judged by 100 places in each pixel.
+    shelf = box_surface("shelf", diffuse("shelf", 0.6), (0.3, 0.3, 0.1), (1.7, 1.7, 0.2))
+    room = lit_room()
+    solution = solved(replace(room, surfaces=(*room.surfaces, shelf)), elements=200)
+    view = camera((1.0, 0.02, 0.6), (1.0, 0.4, 0.0), fov=60, width=9, height=9)
+    gatherer = PictureGatherer(solution, GatherOptions(error=0.02), workers=1)
+    row, column, i, j = (each.ravel() for each in np.indices((9, 9, 10, 10)))
+    pixel = np.arange(len(row)) // 100
+    seen = gatherer.look(view, column + (j + 0.5) / 10, row + (i + 0.5) / 10, pixel, np.arange(len(row)))
+    ends = seen.fragments
+    found = gatherer.gatherer.irradiance(ends.points, ends.normals, own_polygon=ends.polygon, rays=128).irradiance
+    exact = np.bincount(pixel, seen.radiance[:, 0]) + np.bincount(ends.pixel, (ends.gain * found)[:, 0], 81)
+
+    def off():
+        return np.sqrt(np.mean((gatherer.draw(view).radiance.ravel() / (exact / 100) - 1) ** 2))
+
+    assert off() < 0.015  # asked: 0.02
+    monkeypatch.setattr(gather, "INSIDE_TURN", np.inf)
+    assert off() > 0.02
