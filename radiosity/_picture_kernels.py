@@ -10,7 +10,7 @@ from numba import njit
 RIDGE = 1e-3
 """Share of the sum of weights that holds slopes back where samples do not tell them."""
 THROUGH = 1e-4
-"""Square of the distance, as a share of the furthest neighbour's, at which a sharp sample no longer outweighs others."""
+"""Square of the distance, as a share of the furthest neighbour's, below which a sharp sample alone counts, about."""
 REACH = 1.5
 """Values of a fit stay within the samples' range widened by this share of it on either side."""
 

@@ -96,7 +96,7 @@ INSIDE_SPREAD = 0.5
 INSIDE_PLACES = (8, 32)
 """Least and most of them."""
 SHARP = 0.5
-"""A node speaks for itself where it differs from the fit by more than this share of the error, and its standard error."""
+"""A node speaks for itself where it is off the fit by more than its standard error and this share of the error."""
 NOISE = 2.5
 """Standard errors of a node by which it may differ from what was foretold without being uneven."""
 TILE = 256
@@ -833,7 +833,7 @@ class _Tile:
             owner = np.concatenate([owner[kept], alone])
             inside = _Fragments.joined([inside.take(kept), fragments.take(first[alone])])
             mean, doubt, _ = self._mean_of_groups(inside, owner, direct[first[owner]], len(known))
-            found, spread = mean[group], doubt[group]
+            found = mean[group]
             if self.options.indirect:
                 arriving = arriving + found[:, :bands]
             arriving = arriving + np.where(crowded[:, None], found[:, bands:], 0.0)
@@ -957,8 +957,8 @@ class _Tile:
             first = last
 
     def _cast_in(
-        self, pixels: IntArray, rows: IntArray, place: IntArray, wanted: NDArray[np.bool_],
-        shadow: NDArray[np.bool_], seen: FloatArray, moments: FloatArray, parts: list[tuple[_Fragments, IntArray, FloatArray, NDArray[np.bool_]]],
+        self, pixels: IntArray, rows: IntArray, place: IntArray, wanted: NDArray[np.bool_], shadow: NDArray[np.bool_],
+        seen: FloatArray, moments: FloatArray, parts: list[tuple[_Fragments, IntArray, FloatArray, NDArray[np.bool_]]],
     ) -> None:  # fmt: skip
         """Cast rays in pixels ``rows`` at places of the net; direct light is ``wanted`` at some.
 
@@ -1034,7 +1034,9 @@ class _Tile:
         if self.options.rays is not None:
             found = gatherer.indirect(*where, rays=-(-self.options.rays // places), counters=self.counters, seed=seed)
         else:
-            pilot = self.options.pilot_rays if places == 1 else max(2 * self.options.pilot_rays // places, PILOT_RAYS[0])
+            pilot = self.options.pilot_rays
+            if places > 1:
+                pilot = max(2 * pilot // places, PILOT_RAYS[0])
             found = gatherer.indirect(
                 *where, rays=pilot, counters=self.counters, error=NODE_ERROR * math.sqrt(places) * self.options.error,
                 direct=direct, seed=seed,
@@ -1131,14 +1133,16 @@ class _Tile:
     def _mean_of_groups(
         self, fragments: _Fragments, group: IntArray, direct: FloatArray, many: int
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Indirect light (many, 2 bands) of groups of fragments, as nodes hold it, its standard error, and whether any."""
+        """What nodes would hold (many, 2 bands) of groups of fragments, its standard error, and whether it is known."""
         found, spread, _ = self._bundles(fragments, np.arange(len(fragments)), direct, places=INSIDE_PLACES[0])
         weight = fragments.gain.sum(axis=1)
         total = np.bincount(group, weight, many)
         have = total > 0.0
         share = weight / np.where(have, total, 1.0)[group]
-        mean = np.stack([np.bincount(group, share * each, many) for each in found.T], axis=1)
-        square = np.stack([np.bincount(group, (share * each) ** 2, many) for each in spread.T], axis=1)
+        mean, square = np.empty((many, found.shape[1])), np.empty((many, found.shape[1]))
+        for k in range(found.shape[1]):
+            mean[:, k] = np.bincount(group, share * found[:, k], many)
+            square[:, k] = np.bincount(group, (share * spread[:, k]) ** 2, many)
         self.samples["indirect"] += np.bincount(fragments.pixel, minlength=len(self.samples["indirect"]))
         return mean, np.sqrt(square), have
 
