@@ -86,7 +86,7 @@ MOST_PLANES = 150
 """Planes beyond which more do not make a pair dearer: rays see past them."""
 ENGINE_SECONDS, PIECE_SECONDS = 1.5e-3, 2e-5
 """To prepare pairs, and of it each piece."""
-WORTH_A_LOOK = 5e-3
+WORTH_A_LOOK = 3e-3
 """Seconds that pairs must be expected to take for rays to be tried: below, the answer of pairs is the better one."""
 
 _CENTROID = (np.full((1, 3), 1.0 / 3.0), np.ones(1))
@@ -102,6 +102,11 @@ _TRIANGLE_6 = (
     np.repeat([0.223381589678011, 0.109951743655322], 3),
 )  # fmt: skip
 """D. A. Dunavant, "High degree efficient symmetrical Gaussian quadrature rules for the triangle" (1985)."""
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products (..., 3), written out: of few vectors numpy's take several times as long."""
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
 @cache
@@ -173,14 +178,14 @@ def _rule_points(
         across = (1 - u)[:, None] * (c[:, 3] - c[:, 0])[:, None] + u[:, None] * (c[:, 2] - c[:, 1])[:, None]
         row = start[quads][:, None] + np.arange(len(u))
         out[row, :3] = shape @ c
-        out[row, 3] = square[1] * np.linalg.norm(np.cross(along, across), axis=2)
+        out[row, 3] = square[1] * np.linalg.norm(_cross(along, across), axis=2)
     rest = np.flatnonzero(sizes != 4)
     if len(rest):
         which = np.repeat(rest, fans[rest])
         step = np.arange(len(which)) - np.repeat(np.cumsum(fans[rest]) - fans[rest], fans[rest])
         first = pieces.start[which]
         c = pieces.corners[np.stack([first, first + step + 1, first + step + 2], axis=1)]
-        size = 0.5 * np.linalg.norm(np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), axis=1)
+        size = 0.5 * np.linalg.norm(_cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), axis=1)
         n = len(triangle[1])
         row = (start[which] + step * n)[:, None] + np.arange(n)
         out[row, :3] = triangle[0] @ c
@@ -257,7 +262,7 @@ def _mesh_pieces(mesh: _Elements, occluders: Occluders) -> _Pieces:
     after = np.arange(len(mesh.corners)) + 1
     after[start[1:] - 1] = start[:-1]
     origin = mesh.corners[start[:-1]][ring]
-    part = 0.5 * np.cross(mesh.corners - origin, mesh.corners[after] - origin)
+    part = 0.5 * _cross(mesh.corners - origin, mesh.corners[after] - origin)
     signed = np.einsum("ij,ij->i", part, mesh.piece_normal[ring])
     area = np.bincount(ring, signed, len(sizes)).astype(np.float64)
     middle = (origin + mesh.corners + mesh.corners[after]) / 3.0
@@ -381,9 +386,9 @@ def _occluder_frames(occluders: Occluders) -> tuple[FloatArray, FloatArray, Floa
     """Of each occluder its plane's frame (origin, u, v), flat corners, and their lowest and highest (u, v)."""
     count = occluders.count
     # As plane_basis, all at once.
-    u = np.cross(np.eye(3)[np.argmin(np.abs(occluders.normal), axis=1)], occluders.normal)
+    u = _cross(np.eye(3)[np.argmin(np.abs(occluders.normal), axis=1)], occluders.normal)
     u /= np.linalg.norm(u, axis=1)[:, None]
-    frame = np.hstack([occluders.corners[occluders.start[:-1]], u, np.cross(occluders.normal, u)])
+    frame = np.hstack([occluders.corners[occluders.start[:-1]], u, _cross(occluders.normal, u)])
     ring = np.repeat(np.arange(count), np.diff(occluders.start))
     off = occluders.corners - frame[ring, :3]
     flat = np.stack([np.einsum("ij,ij->i", off, frame[ring, 3:6]), np.einsum("ij,ij->i", off, frame[ring, 6:])], axis=1)
@@ -932,11 +937,14 @@ def _pair_seconds(mesh: _Elements, geometry: Geometry, rows: int, error: float) 
     prepare = ENGINE_SECONDS + PIECE_SECONDS * pieces
     if pieces >= LARGE:
         return prepare + pairs * PAIR_SECONDS * math.sqrt(0.02 / error)
-    normal = geometry.polygon_normal
-    corner = geometry.corners[geometry.piece_start[geometry.polygon_piece_start[:-1]]] - geometry.bounds[0]
-    plane = np.column_stack([normal, np.einsum("ij,ij->i", normal, corner) / geometry.size])
-    plane *= np.where(plane[np.arange(len(plane)), np.abs(normal).argmax(axis=1)] < 0, -1.0, 1.0)[:, None]
-    planes = min(len(np.unique(np.round(1e6 * plane + 0.237), axis=0)), MOST_PLANES)
+    planes = geometry.polygon_count
+    if prepare + pairs * (FEW_SECONDS + planes / pieces * PLANE_SECONDS) > WORTH_A_LOOK:
+        normal = geometry.polygon_normal
+        corner = geometry.corners[geometry.piece_start[geometry.polygon_piece_start[:-1]]] - geometry.bounds[0]
+        plane = np.column_stack([normal, np.einsum("ij,ij->i", normal, corner) / geometry.size])
+        plane *= np.where(plane[np.arange(len(plane)), np.abs(normal).argmax(axis=1)] < 0, -1.0, 1.0)[:, None]
+        planes = len(np.unique(np.round(1e6 * plane + 0.237), axis=0))
+    planes = min(planes, MOST_PLANES)
     refine = CLUTTER_SECONDS * planes * (0.01 / error) ** 0.9 * rows / pieces
     return prepare + pairs * (FEW_SECONDS + planes / pieces * (PLANE_SECONDS + refine))
 

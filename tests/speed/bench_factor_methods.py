@@ -6,8 +6,9 @@ Form factors between all polygons of a scene by ``view_factors`` to several erro
 and hemisphere rays with settings by hand, interleaved.  The reference is exact cuts to 1e-6, and where polygons
 are many 67 million rays, whose noise is taken off.  Rows as in ``bench_shadow_methods.py``: errors are
 root mean squares over the pairs relative to the mean, seconds are of the processor, the least of the repeats.
-Two-sided surfaces count by their front, panes as opaque.  Without scenes: the built-in ones of up to 3,000
-polygons, and those of ``../shared/scenes-external`` where they are found.
+Each method prepares itself in each run (flattens the scene, builds its trees), as ``auto`` does; with
+``--prepared`` all but ``auto`` are prepared beforehand.  Two-sided surfaces count by their front, panes as opaque.
+Without scenes: the built-in ones of up to 3,000 polygons, and those of ``../shared/scenes-external`` that are found.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from bench_shadow_methods import HERE, ratios
 
 import workbench
 from radiosity.report.speed_accuracy import measure
-from radiosity.report.techniques import Reference, ViewFactors, _repeated
+from radiosity.report.techniques import Answer, Reference, Technique, ViewFactors, _repeated
 from workbench.errors import WorkbenchError
 from workbench.scene.load import built_in_scenes
 from workbench.scene.model import Scene
@@ -58,6 +59,18 @@ def one_sided(scene: Scene) -> Scene:
     return replace(scene, surfaces=tuple(changed))
 
 
+class Unprepared(ViewFactors):
+    """View factors whose techniques prepare themselves in each run."""
+
+    def technique(self, name: str) -> Technique:
+        made = super().technique(name)
+
+        def ask(value: float, seed: int) -> Answer:
+            return ViewFactors(self.scene, workers=self.workers).technique(name).ask(value, seed)
+
+        return made if name == "auto" else replace(made, ask=ask)
+
+
 def reference(problem: ViewFactors) -> Reference:
     """Exact cuts, or rays."""
     polygons = problem.geometry.polygon_count
@@ -68,8 +81,8 @@ def reference(problem: ViewFactors) -> Reference:
     return _repeated(lambda seed: ask(samples, seed).values, f"4 x {samples:,} rays a polygon")
 
 
-def rows_of(name: str, repeats: int, limit: float) -> list[dict]:
-    problem = ViewFactors(one_sided(workbench.load(name)))
+def rows_of(name: str, repeats: int, limit: float, prepared: bool) -> list[dict]:
+    problem = (ViewFactors if prepared else Unprepared)(one_sided(workbench.load(name)))
     polygons = problem.geometry.polygon_count
     if polygons > MOST_POLYGONS:
         print(f"{name}: {polygons:,} polygons are more than {MOST_POLYGONS:,}")
@@ -87,10 +100,11 @@ if __name__ == "__main__":
     parser.add_argument("scenes", nargs="*", default=scenes())
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--limit", type=float, default=2.0, help="seconds of a run beyond which it is not repeated")
+    parser.add_argument("--prepared", action="store_true", help="leave out what all but auto take to prepare")
     asked = parser.parse_args()
     for name in asked.scenes:
         try:
-            table = rows_of(name, asked.repeats, asked.limit)
+            table = rows_of(name, asked.repeats, asked.limit, asked.prepared)
         except WorkbenchError as problem_found:
             print(f"{name} is left out: {problem_found}", flush=True)
             continue
