@@ -15,7 +15,11 @@ IntArray = NDArray[np.int64]
 
 FIRST_RAYS = 32
 """Rays of a pair before it is known how much they differ."""
+COARSE, COARSE_RAYS = 0.1, 16
+"""Wanted error of a share above which fewer do, and those."""
 MOST_RAYS = 2048
+FEW_PAIRS, LEAST_PRIOR = 50, 0.1
+"""Fewer pairs say nothing of each other; pseudo-rays by which they say it at the least."""
 
 # Generalised golden ratio in four dimensions (M. Roberts 2018): g solves g^5 = g + 1.
 _G4 = 1.1673039782614187
@@ -137,17 +141,44 @@ def _trace(
 
 
 def _shares(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Visible share of each pair and its standard error."""
+    """Visible share of each pair, and the number of rays of equal weight that tell as much of it as its own."""
     whole = np.where(sums[:, 1] > 0, sums[:, 1], 1.0)
     share = np.where(sums[:, 1] > 0, sums[:, 0] / whole, 0.5)
-    effective = np.where(sums[:, 1] > 0, whole**2 / np.where(sums[:, 2] > 0, sums[:, 2], 1.0), 0.0)
-    # Two pseudo-rays, one of each kind, so that agreeing rays still leave a doubt.
-    safe = (share * effective + 1.0) / (effective + 2.0)
-    return share, np.sqrt(safe * (1.0 - safe) / (effective + 2.0))
+    return share, np.where(sums[:, 1] > 0, whole**2 / np.where(sums[:, 2] > 0, sums[:, 2], 1.0), 0.0)
+
+
+def _prior(share: FloatArray, rays: FloatArray, weight: FloatArray) -> FloatArray:
+    """Pseudo-rays (2,) that arrive and that do not, by which each pair is taken to be like the others (empirical Bayes).
+
+    Most pairs of small pieces see each other whole or not at all: rays that agree then tell more than they do by
+    themselves.  Moments of the beta-binomial distribution (J. C. Kleinman, JASA 68, 1973), each pair by its
+    ``weight``; of few pairs, or many that see each other in part, one pseudo-ray of either kind (Laplace).
+    """
+    told = rays > 1.0
+    few = np.ones(2)
+    if told.sum() < FEW_PAIRS:
+        return few
+    w = weight[told] / weight[told].sum()
+    if w.max() * FEW_PAIRS > 1.0:
+        return few
+    mean = float(w @ share[told])
+    scatter = float(w @ (share[told] - mean) ** 2)
+    by_chance = float(w @ (1.0 / rays[told]))
+    whole = mean * (1.0 - mean)
+    alike = (scatter - whole * by_chance) / (whole * (1.0 - by_chance)) if whole > 0.0 else 0.0
+    total = min(max(1.0 / max(alike, 1e-9) - 1.0, LEAST_PRIOR), 2.0)
+    mean = (mean * len(w) + 1.0) / (len(w) + 2.0)
+    return total * np.array([mean, 1.0 - mean])
+
+
+def _doubts(share: FloatArray, rays: FloatArray, prior: FloatArray) -> FloatArray:
+    """Standard error of each visible share."""
+    mean = (share * rays + prior[0]) / (rays + prior.sum())
+    return np.sqrt(mean * (1.0 - mean) / (rays + prior.sum() + 1.0))
 
 
 def ray_shares(
-    pairs: IntArray, goals: FloatArray, seed: int, pieces, sight: Sight, most: int = MOST_RAYS
+    pairs: IntArray, goals: FloatArray, weight: FloatArray, seed: int, pieces, sight: Sight, most: int = MOST_RAYS
 ) -> tuple[FloatArray, FloatArray, int]:
     """Visible share of each pair of pieces by rays, its standard error, and the rays traced.
 
@@ -156,6 +187,8 @@ def ray_shares(
     pairs : (m, 2) int
     goals : (m,) float
         Wanted standard error of each share.
+    weight : (m,) float
+        What each share is a share of.
     seed : int
     pieces
         Corners, start, normal and area of the pieces.
@@ -164,17 +197,17 @@ def ray_shares(
         Most rays of a pair.
     """
     sums = np.zeros((len(pairs), 3))
-    counts = np.full(len(pairs), FIRST_RAYS, dtype=np.int64)
+    counts = np.where(goals > COARSE, COARSE_RAYS, FIRST_RAYS)
     begin = np.zeros(len(pairs), dtype=np.int64)
     traced = _trace(pairs, begin, counts, seed, pieces, sight, sums)
-    _, doubt = _shares(sums)
-    wanted = np.minimum((doubt / goals) ** 2 * FIRST_RAYS, most)
-    more = np.flatnonzero(wanted > 1.5 * FIRST_RAYS)
+    share, rays = _shares(sums)
+    prior = _prior(share, rays, weight)
+    wanted = np.minimum((_doubts(share, rays, prior) / goals) ** 2 * counts, most)
+    more = np.flatnonzero(wanted > 1.5 * counts)
     if len(more):
-        extra = np.ceil(wanted[more]).astype(np.int64) - FIRST_RAYS
+        extra = np.ceil(wanted[more]).astype(np.int64) - counts[more]
         part = sums[more]
-        begin = np.full(len(more), FIRST_RAYS, dtype=np.int64)
-        traced += _trace(np.ascontiguousarray(pairs[more]), begin, extra, seed, pieces, sight, part)
+        traced += _trace(np.ascontiguousarray(pairs[more]), counts[more], extra, seed, pieces, sight, part)
         sums[more] = part
-    share, doubt = _shares(sums)
-    return share, doubt, traced
+        share, rays = _shares(sums)
+    return share, _doubts(share, rays, prior), traced

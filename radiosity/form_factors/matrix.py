@@ -549,7 +549,7 @@ class _Engine:
         goals = self.care.share_error * (1.0 + self.care.floor * smaller / whole)
         goals = np.minimum(goals, threshold / (whole * (importance[i] + importance[j])))
         most = MOST_RAYS if threshold == math.inf else REFINING_RAYS
-        share, doubt, traced = ray_shares(pairs, goals, self.seed, self.pieces, self.sight(), most)
+        share, doubt, traced = ray_shares(pairs, goals, whole, self.seed, self.pieces, self.sight(), most)
         out[i - base, j] = whole * share
         spread[i - base, j] = spread[i - base, j] * share + whole * doubt
         return traced
