@@ -18,8 +18,8 @@ FIRST_RAYS = 32
 COARSE, COARSE_RAYS = 0.1, 16
 """Wanted error of a share above which fewer do, and those."""
 MOST_RAYS = 2048
-FEW_PAIRS, LEAST_PRIOR = 50, 0.1
-"""Fewer pairs say nothing of each other; pseudo-rays by which they say it at the least."""
+FEW_PAIRS, LEAST_PRIOR, MOST_PRIOR = 50, 0.1, 50.0
+"""Fewer pairs say nothing of each other; least and most pseudo-rays of what they say."""
 
 # Generalised golden ratio in four dimensions (M. Roberts 2018): g solves g^5 = g + 1.
 _G4 = 1.1673039782614187
@@ -148,11 +148,11 @@ def _shares(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _prior(share: FloatArray, rays: FloatArray, weight: FloatArray) -> FloatArray:
-    """Pseudo-rays (2,) that arrive and that do not, by which each pair is taken to be like the others (empirical Bayes).
+    """Pseudo-rays (2,) that arrive and do not, by which each pair is taken to be like the others (empirical Bayes).
 
     Most pairs of small pieces see each other whole or not at all: rays that agree then tell more than they do by
     themselves.  Moments of the beta-binomial distribution (J. C. Kleinman, JASA 68, 1973), each pair by its
-    ``weight``; of few pairs, or many that see each other in part, one pseudo-ray of either kind (Laplace).
+    ``weight``; of few pairs one pseudo-ray of either kind (Laplace).
     """
     told = rays > 1.0
     few = np.ones(2)
@@ -166,15 +166,15 @@ def _prior(share: FloatArray, rays: FloatArray, weight: FloatArray) -> FloatArra
     by_chance = float(w @ (1.0 / rays[told]))
     whole = mean * (1.0 - mean)
     alike = (scatter - whole * by_chance) / (whole * (1.0 - by_chance)) if whole > 0.0 else 0.0
-    total = min(max(1.0 / max(alike, 1e-9) - 1.0, LEAST_PRIOR), 2.0)
+    total = min(max(1.0 / max(alike, 1e-9) - 1.0, LEAST_PRIOR), MOST_PRIOR)
     mean = (mean * len(w) + 1.0) / (len(w) + 2.0)
     return total * np.array([mean, 1.0 - mean])
 
 
 def _doubts(share: FloatArray, rays: FloatArray, prior: FloatArray) -> FloatArray:
-    """Standard error of each visible share."""
+    """Standard error of each visible share: about it, not about the mean of what it may be."""
     mean = (share * rays + prior[0]) / (rays + prior.sum())
-    return np.sqrt(mean * (1.0 - mean) / (rays + prior.sum() + 1.0))
+    return np.sqrt(mean * (1.0 - mean) / (rays + prior.sum() + 1.0) + (mean - share) ** 2)
 
 
 def ray_shares(

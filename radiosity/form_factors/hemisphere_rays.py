@@ -139,8 +139,8 @@ def _summed(counts, total, variance):
 def least_seconds(rows: int, pieces: int, error: float) -> float:
     """Processor seconds that rays take at the least: to prepare, to trace what the easiest rows need, to sum up.
 
-    Rows were measured to need from 1.1 error^-2 rays at 0.01, where they see few others, and from 0.04 n error^-2 at 0.1
-    where they see many of n, less at smaller errors.
+    Rows were measured to need from 1.1 error^-2 rays at 0.01, where they see few others, and from 0.04 n error^-2 at
+    0.1 where they see many of n, less at smaller errors.
     """
     rays = max(FIRST_RAYS * RANDOMISATIONS, 0.3 * error**-1.9, 0.02 * rows * error**-1.9)
     return START_SECONDS + PIECE_SECONDS * pieces + rows * rays * RAY_SECONDS + rows**2 * ENTRY_SECONDS

@@ -8,7 +8,7 @@ from radiosity_scenes import UNIT, each_truth, polygon_scene, truth
 from view_factor_scenes import closed_room
 
 import radiosity
-from radiosity.form_factors import matrix
+from radiosity.form_factors import _ray_shares, matrix
 from radiosity.form_factors.analytic import polygon_to_polygon
 from radiosity.form_factors.matrix import close_rows
 from workbench.errors import InputError, MemoryForecastError, OptionError
@@ -133,6 +133,24 @@ def test_long_candidate_lists_get_rays(monkeypatch):
     # One standard error: the z values of the entries that are seen in part.
     z = off[stated > 1e-5] / stated[stated > 1e-5]
     assert len(z) > 50 and np.sqrt((z**2).mean()) < 1.5
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.1, 0.1), (0.05, 0.5), (1.0, 1.0), (3.0, 1.0)])
+def test_doubts_of_rays_are_those_of_pairs_that_are_alike(a, b):
+    # Shares drawn from a beta distribution, and rays from them: of 20,000 a root mean square is known to 1 %.
+    rng = np.random.default_rng(11)
+    for rays in (4, 16, 64):
+        true = rng.beta(a, b, 20000)
+        share, many = rng.binomial(rays, true) / rays, np.full(20000, float(rays))
+        doubt = _ray_shares._doubts(share, many, _ray_shares._prior(share, many, np.ones(20000)))
+        actual = np.sqrt(((share - true) ** 2).mean())
+        assert 0.85 < np.sqrt((doubt**2).mean()) / actual < 1.4
+        # Where all rays agree, too.
+        same = (share == 0) | (share == 1)
+        off, said = (np.sqrt((v[same] ** 2).mean()) for v in (share - true, doubt))
+        assert 0.75 < said / off < 2.5
+    few = _ray_shares._prior(share[:20], many[:20], np.ones(20))
+    assert few.tolist() == [1.0, 1.0]
 
 
 def test_panes_dim_rays_too(monkeypatch):
