@@ -1,4 +1,4 @@
-"""Hemisphere bundles as kernels: cosine-equal rays from points, and what their hits send back."""
+"""Gathering as kernels: places of sensors, cosine-equal rays from points, and what their hits send back."""
 
 from __future__ import annotations
 
@@ -8,11 +8,74 @@ import numpy as np
 from numba import njit
 
 from radiosity.element_lookup import search_list
+from workbench.accel.box_tree import boxes_meeting_planes
 from workbench.sampling.sequences import hashed, owen_scramble
 from workbench.shadow._sky import relative_radiance
 
 RUNS = 4
 """Blocks of one point's rays that are told apart: each is a net of its own, their spread tells the error."""
+
+
+ALIKE, CROSSING = 0.9, 0.1
+"""Cosine from which a surface faces as a sensor does, and sine from which it crosses the sensor's plane."""
+
+
+@njit(nogil=True, cache=True)
+def stand_in_front(
+    points, normals, own, corners, starts, piece_polygon, polygon_normal, one_sided, low, high, skip, first, count,
+    order, bounds, near, tally,
+):  # fmt: skip
+    """Move ``points`` (n, 3) that lie on surfaces, or less than ``near`` off them, to the side that can be seen.
+
+    ``own`` (n,) gets the polygon that faces as the sensor does, the nearest one; a point behind it moves onto it.  A
+    point on a one-sided polygon that rises before the sensor, as on the line where a wall meets the floor, moves
+    ``near`` before that: on the line itself half of what is seen would lie behind the wall.
+    """
+    planes, found = np.empty((6, 4)), np.empty(64, dtype=np.int64)
+    for i in range(points.shape[0]):
+        n = normals[i]
+        own[i] = -1
+        closest = np.inf
+        # The own polygon first, then what rises before it, twice: two walls may meet there.
+        for step in range(3):
+            p = points[i].copy()
+            for axis in range(3):
+                planes[2 * axis : 2 * axis + 2] = 0.0
+                planes[2 * axis, axis], planes[2 * axis, 3] = 1.0, p[axis] - near
+                planes[2 * axis + 1, axis], planes[2 * axis + 1, 3] = -1.0, -p[axis] - near
+            many = boxes_meeting_planes(low, high, skip, first, count, order, bounds, planes, 6, 0.0, found, tally)
+            for k in range(min(many, found.shape[0])):
+                piece = found[k]
+                polygon = piece_polygon[piece]
+                a, b = starts[piece], starts[piece + 1]
+                m = polygon_normal[polygon]
+                off, facing = 0.0, 0.0
+                for axis in range(3):
+                    off += m[axis] * (p[axis] - corners[a, axis])
+                    facing += m[axis] * n[axis]
+                if abs(off) > near:
+                    continue
+                inside, rise = True, -np.inf
+                for c in range(a, b):
+                    side = corners[c + 1 if c + 1 < b else a] - corners[c]
+                    away = p - corners[c]
+                    inward = np.cross(side, away)
+                    inside = inside and (inward * m).sum() >= -near * math.sqrt((side * side).sum())
+                    rise = max(rise, -(away * n).sum())
+                if not inside:
+                    continue
+                if step == 0:
+                    alike = facing > ALIKE or (facing < -ALIKE and not one_sided[polygon])
+                    if alike and abs(off) < closest:
+                        closest, own[i] = abs(off), polygon
+                        if off * facing < 0.0:
+                            points[i] = p - off * m
+                elif one_sided[polygon] and rise > near and off < near and polygon != own[i]:
+                    along = m - facing * n
+                    square = (along * along).sum()
+                    if square > CROSSING * CROSSING:
+                        points[i] += (near - off) / square * along
+                        break
 
 
 @njit(nogil=True, cache=True)

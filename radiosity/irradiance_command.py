@@ -77,6 +77,9 @@ def irradiance(
     solution.  Direct light (lamps, sky) is found at each point exactly where it can be, indirect light
     is gathered from the solution.
 
+    A point on a surface, or within rounding of it, counts as just before the side that it faces, and one on
+    the line where two surfaces meet as just before both.
+
     OUT.csv repeats the points and adds, for each band, irradiance, its direct and indirect part and its
     standard error, in W/m2.  The standard error is what sampling leaves; the solution's own error is
     printed, and stands in the record.

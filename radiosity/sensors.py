@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radiosity._exact_gather import exact_gather
-from radiosity._gather_kernels import RUNS, collect_hits, gather_rays
+from radiosity._gather_kernels import RUNS, collect_hits, gather_rays, stand_in_front
 from radiosity.element_lookup import ElementLookup, bounding_rectangle, element_gradients
 from radiosity.patches import PatchMesh
 from radiosity.solvers.solution import Solution
@@ -302,7 +302,9 @@ class Gatherer(DirectLight):
         normals : (n, 3) or (3,) float
             Of the receiving side, any length but zero.
         own_polygon : (n,) int or int, optional
-            Polygon of the geometry on which each point lies, which never shadows it; -1 for none.
+            Polygon of the geometry on which each point lies, which never shadows it; -1 for none.  Unless
+            given it is looked for: a point on a surface, or off it by less than a 2,000,000th of the scene's
+            size, counts as lying on the side that it faces, and one where two surfaces meet as just before both.
         error : float
             Wanted error: root mean square over the points, relative to their mean irradiance.
         rays : int, optional
@@ -324,7 +326,9 @@ class Gatherer(DirectLight):
             raise OptionError(f"rays: found {rays}, expected 1 to {MOST_RAYS}")
         counters, seconds = Counters(), {}
         begin = time.perf_counter()
-        who = np.full(len(place), -1, dtype=np.int64) if own_polygon is None else own_polygon
+        if own_polygon is None:
+            place, own_polygon = self._stand_in_front(place, facing)
+        who = own_polygon
         straight = self.direct(place, facing, own_polygon=who, error=error, counters=counters)
         seconds["direct"] = time.perf_counter() - begin
         begin = time.perf_counter()
@@ -337,6 +341,18 @@ class Gatherer(DirectLight):
         return IrradianceEstimate(
             whole, direct, found.indirect, doubt, found.distance, reached, method, counters, seconds
         )
+
+    def _stand_in_front(self, points: FloatArray, normals: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Points (n, 3) moved off surfaces to the side that is seen, and the polygons (n,) on which they lie."""
+        geometry, own = self.geometry, np.empty(len(points), dtype=np.int64)
+        one_sided = np.array([not material.two_sided for material in geometry.surface_material])
+        moved = points.copy()
+        stand_in_front(
+            moved, normals, own, geometry.corners, geometry.piece_start, geometry.piece_polygon,
+            geometry.polygon_normal, one_sided[geometry.polygon_surface], *self.shader.tree,
+            self.shader.tracer.offset, new_tally(),
+        )  # fmt: skip
+        return moved, own
 
     def indirect(
         self,

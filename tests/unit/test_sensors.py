@@ -233,3 +233,51 @@ def test_hits_on_elements_that_are_coarse_for_their_distance_are_gathered_again(
     plain = np.sqrt((((read.irradiance[:, 0] - wanted) / wanted) ** 2).mean())
     assert off < 0.5 * plain and off < 0.02
     assert found.counters["rays"] > read.counters["rays"]
+
+
+@pytest.fixture(scope="module")
+def furnished():
+    # A closed room of one grey with a box on the floor and a lamp; the box has no bottom.
+    grey = diffuse("grey", 0.6)
+    lamp = np.array([[1.5, 1, 2.6], [1.5, 2, 2.6], [2.5, 2, 2.6], [2.5, 1, 2.6]], float)
+    surfaces = (
+        box_surface("room", grey, (0, 0, 0), (4, 3, 2.7), inward=True),
+        box_surface("table", grey, (2, 1, 0), (3, 2, 0.8), omit=["-z"]),
+        Surface.from_polygons("lamp", diffuse("lamp", 0.0, 100.0), [lamp]),
+    )
+    scene = Scene("furnished", surfaces, background=np.zeros(1), bands=1, closed=True)
+    return Gatherer(radiosity.solve(scene, elements=200, workers=1), workers=1)
+
+
+UP, WEST = (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("place", "normal", "beside"),
+    [
+        ((1.0, 1.5, -1e-9), UP, (0, 0, 1e-9)),  # rounded to behind the floor
+        ((1.0, 1.5, -1e-6), UP, (0, 0, 1e-6)),
+        ((2.5, 1.5, 0.8 - 1e-7), UP, (0, 0, 1e-7)),  # and into the table
+        ((0.0, 1.5, 0.0), UP, (1e-3, 0, 0)),  # where the floor meets a wall,
+        ((0.0, 0.0, 0.0), UP, (1e-3, 1e-3, 0)),  # two walls,
+        ((2.0, 1.5, 0.0), UP, (-1e-3, 0, 0)),  # the foot of the table
+        ((2.0, 1.0, 0.0), WEST, (0, 1e-3, 1e-3)),  # and the foot of its edge
+        ((2.0, 1.5, 0.8), WEST, (0, 0, -1e-3)),  # the rim of its top hides nothing
+        ((2.0, 1.5, 0.8), UP, (1e-3, 0, 0)),
+    ],
+)
+def test_sensors_on_surfaces_and_where_they_meet_see_what_those_just_beside_them_see(furnished, place, normal, beside):
+    places = np.array([place, np.add(place, beside)])
+    found = furnished.irradiance(places, normal, rays=4096)
+    assert found.irradiance[0] == pytest.approx(found.irradiance[1], rel=0.02)
+    # The answer is the same whatever else is asked, and nothing is moved that does not touch.
+    free = furnished.irradiance([(1.0, 1.5, 0.5)], UP, rays=64)
+    np.testing.assert_array_equal(
+        free.irradiance, furnished.irradiance([(1.0, 1.5, 0.5)], UP, rays=64, own_polygon=-1).irradiance
+    )
+
+
+def test_sensors_inside_solids_and_behind_surfaces_get_nothing(furnished):
+    places = [(2.5, 1.5, 0.4), (1.0, 1.5, -1e-3), (1.0, 1.5, 0.0)]
+    found = furnished.irradiance(places, [UP, UP, (0.0, 0.0, -1.0)], rays=64)
+    assert not found.irradiance.any()
