@@ -121,8 +121,10 @@ BETWEEN_ROUNDS, ROWS_OFF = 1e-3, 1e-11
 """What balanced row sums may be off while links are still refined, and at the end."""
 LEAST_LOOSE, LOOSE_ROUNDS = 0.02, 10
 """Least share of a link that row balancing may scale, and rounds before everything is scaled."""
-COVER_POINTS, COVER_RAYS = (8, 16), (1, 6)
-"""Points of an element, and rays from each, that tell how much of it is covered: of all, and of doubtful ones."""
+COVER_RAYS = (1, 6)
+"""Rays from each point that tell whether it is covered: of all elements, and of doubtful ones at twice the points."""
+LEAST_COVER_POINTS, MOST_COVER_POINTS, ALL_COVER_POINTS = 8, 256, 2**14
+"""Points of an element, and of all surfaces: few points of few elements made the bare area of a room 1 % too large."""
 PAIR_BYTES = 220
 """Memory that a new pair takes while it is measured, and as a link with both its directions."""
 SMALLEST = 2.0**-14
@@ -284,7 +286,10 @@ class _Exchange:
         everything where that does not do.
         """
         links, area = self.links, self.tree.arrays.area
-        off = np.maximum(np.maximum(links.bend_a * area[links.a], links.bend_b * area[links.b]), links.doubt)
+        # How a form factor varies over an element does nothing to the element's row.
+        off = np.array(links.doubt, dtype=np.float64)
+        for end, bend in ((links.a, links.bend_a), (links.b, links.bend_b)):
+            np.maximum(off, bend * area[end] * self.tree.arrays.opened[end], out=off)
         share = np.divide(off, self.exchange, out=np.ones_like(self.exchange), where=self.exchange > 0)
         share = np.clip(share, LEAST_LOOSE, 1.0)
         self.loose = self._sorted(self.exchange * share)
@@ -523,7 +528,7 @@ class _Solver:
             self.seconds_in_embree += time.perf_counter() - clock
             apply_rays(
                 block, many, pairs.a, pairs.b, whole[block], starts, weights, blocked, self.tree.arrays.area,
-                pairs.exchange, pairs.vary_a, pairs.vary_b, pairs.bend_a, pairs.bend_b, pairs.doubt,
+                self.tree.arrays.flat, pairs.exchange, pairs.vary_a, pairs.vary_b, pairs.bend_a, pairs.bend_b, pairs.doubt,
             )  # fmt: skip
             traced.append(used)
 
@@ -723,30 +728,38 @@ class _Solver:
         One ray a point first; only where one ends at a back the others follow.
         """
         out = np.ones(len(nodes))
-        step = BLOCK_RAYS // COVER_RAYS[1]
         flat = np.flatnonzero(self.tree.arrays.flat[nodes] == 1)
-        for points, rays in zip(COVER_POINTS, COVER_RAYS, strict=True):
-            asked, flat = flat, flat[:0]
-            for first in range(0, len(asked), step):
-                own = asked[first : first + step]
-                mesh = self.tree.mesh(nodes[own])
-                start = points_of_elements(mesh, np.arange(len(own)), points, self.seed)
-                normals = np.repeat(mesh.element_normal, points, axis=0)
-                # Streams are told apart by the nodes, whatever block they are in.
-                along = cosine_directions(normals, rays, [self.seed, int(nodes[own[0]]), rays])
-                start = np.repeat(start + self.accelerator.offset * normals, rays, axis=0)
-                centre, scale = self.accelerator.frame
-                hit = self.accelerator.nearest_raw(
-                    ((start - centre) * scale).astype(np.float32), (along * scale).astype(np.float32)
-                )
-                backs = (hit >= 0) & ~self.two_sided[hit]
-                backs &= np.einsum("ij,ij->i", along, self.geometry.polygon_normal[hit]) > 0
-                covered = backs.reshape(len(own), points, rays).all(axis=2)
-                out[own] = 1.0 - covered.mean(axis=1)
-                flat = np.concatenate([flat, own[covered.any(axis=1)]])
-                self.counters.add(rays=len(hit))
-            out[asked[~np.isin(asked, flat)]] = 1.0
+        wanted = ALL_COVER_POINTS * self.tree.arrays.area[nodes] / self.total_area
+        wanted = np.clip(2 ** np.ceil(np.log2(np.maximum(wanted, 1.0))), LEAST_COVER_POINTS, MOST_COVER_POINTS)
+        for points in np.unique(wanted[flat]).astype(int).tolist():
+            asked = flat[wanted[flat] == points]
+            for times, rays in enumerate(COVER_RAYS, start=1):
+                asked = self._cover(nodes, asked, times * points, rays, out)
         return out
+
+    def _cover(self, nodes: IntArray, asked: IntArray, points: int, rays: int, out: FloatArray) -> IntArray:
+        """Bare shares of the rows ``asked``, by so many points and rays from each; those in part covered."""
+        step = max(BLOCK_RAYS // (points * rays), 1)
+        doubtful = [asked[:0]]
+        for first in range(0, len(asked), step):
+            own = asked[first : first + step]
+            mesh = self.tree.mesh(nodes[own])
+            start = points_of_elements(mesh, np.arange(len(own)), points, self.seed)
+            normals = np.repeat(mesh.element_normal, points, axis=0)
+            # Streams are told apart by the nodes, whatever block they are in.
+            along = cosine_directions(normals, rays, [self.seed, int(nodes[own[0]]), rays])
+            start = np.repeat(start + self.accelerator.offset * normals, rays, axis=0)
+            centre, scale = self.accelerator.frame
+            hit = self.accelerator.nearest_raw(
+                ((start - centre) * scale).astype(np.float32), (along * scale).astype(np.float32)
+            )
+            backs = (hit >= 0) & ~self.two_sided[hit]
+            backs &= np.einsum("ij,ij->i", along, self.geometry.polygon_normal[hit]) > 0
+            covered = backs.reshape(len(own), points, rays).all(axis=2)
+            out[own] = 1.0 - covered.mean(axis=1)
+            doubtful.append(own[covered.any(axis=1)])
+            self.counters.add(rays=len(hit))
+        return np.concatenate(doubtful)
 
     def refine_for_lights(self, error: float, unit: FloatArray) -> None:
         """Split leaves over which the light from outside the mesh varies by more than ``error``."""
