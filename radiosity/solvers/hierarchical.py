@@ -528,7 +528,8 @@ class _Solver:
             self.seconds_in_embree += time.perf_counter() - clock
             apply_rays(
                 block, many, pairs.a, pairs.b, whole[block], starts, weights, blocked, self.tree.arrays.area,
-                self.tree.arrays.flat, pairs.exchange, pairs.vary_a, pairs.vary_b, pairs.bend_a, pairs.bend_b, pairs.doubt,
+                self.tree.arrays.flat, pairs.exchange, pairs.vary_a, pairs.vary_b, pairs.bend_a, pairs.bend_b,
+                pairs.doubt,
             )  # fmt: skip
             traced.append(used)
 

@@ -435,6 +435,34 @@ def test_coarse_links_shift_the_mean_by_no_more_than_a_few_thousandths(monkeypat
     assert math.sqrt(area @ off**2 / area.sum()) < 0.06 * fine.mean_irradiance.mean()
 
 
+@pytest.mark.parametrize("elements", [20, 40])
+def test_few_elements_know_what_stands_on_them(elements, monkeypatch):
+    # The box covers 0.09 of the floor: eight points an element found 0.19 and 0.03.
+    solution, exchange = exchanged(standing_box(), monkeypatch, elements=elements)
+    mesh = solution.mesh
+    floor = (mesh.element_centroid[:, 2] == 0) & (mesh.element_normal[:, 2] > 0)
+    assert exchange.area[floor].sum() == pytest.approx(0.91, abs=0.01)
+
+
+def test_dark_boxes_close_to_a_ceiling_take_no_light_from_bright_walls(monkeypatch):
+    # Their hidden tops see the gap alone.  Points passed it by, rows were filled with what came to their sides, and
+    # the room was 3.7 % too dark.
+    walls = box_surface("room", diffuse("wall", 0.8), *UNIT, inward=True, omit=["-z"])
+    floor = box_surface("floor", diffuse("floor", 0.3, 1.0), *UNIT, inward=True, omit=["-x", "+x", "-y", "+y", "+z"])
+    boxes = [
+        box_surface(f"box {x} {y}", diffuse("box", 0.05), [x - 0.15, y - 0.15, 0.94], [x + 0.15, y + 0.15, 0.98])
+        for x, y in ((0.25, 0.25), (0.75, 0.25), (0.5, 0.5), (0.25, 0.75), (0.75, 0.75))
+    ]
+    scene = Scene("boxes", (walls, floor, *boxes), bands=1, closed=True)
+    judge = radiosity.solve(scene, method="matrix", elements=1000, form_factor_error=5e-3, workers=2)
+    solution, exchange = exchanged(scene, monkeypatch, elements=250, direct_in_mesh=False)
+    found, wanted = (
+        area @ (s.radiosity - s.mesh.emission)[:, 0]
+        for s, area in ((solution, exchange.area), (judge, judge.mesh.element_area))
+    )
+    assert found == pytest.approx(wanted, rel=0.02)
+
+
 def test_links_end_where_the_elements_asked_for_end():
     # Refined on without elements, links were 8 an element.
     solution = solve(workbench.load("office"), elements=6000, workers=2)
