@@ -579,7 +579,7 @@ class _Engine:
             return self._sight
 
 
-def close_rows(exchange: Matrix, wanted: FloatArray, to: float = CLOSED_TO) -> FloatArray:
+def close_rows(exchange: Matrix, wanted: FloatArray, to: float = CLOSED_TO, *, over_area: bool = False) -> FloatArray:
     """Scale factors x so that ``x_i x_j S_ij`` has the wanted row sums; rows of nothing keep 1.
 
     Symmetric scaling keeps reciprocity, zeros and signs (cf. J. van Leersum, "A method for determining a
@@ -593,8 +593,10 @@ def close_rows(exchange: Matrix, wanted: FloatArray, to: float = CLOSED_TO) -> F
     wanted : (n,) float
         Row sums to reach: the areas, without what is covered of them.
     to : float
-        Relative error of a row sum at which the scaling ends.  Two faces of a narrow gap see hardly more than each
-        other: their sums close very slowly.
+        Relative error of the row sums at which the scaling ends.
+    over_area : bool
+        Whether their mean is meant, weighted by ``wanted``, and not the worst.  Two faces of a narrow gap see hardly
+        more than each other: their sums close very slowly.
 
     Returns
     -------
@@ -605,7 +607,8 @@ def close_rows(exchange: Matrix, wanted: FloatArray, to: float = CLOSED_TO) -> F
         sums = x * (exchange @ x)
         live = (sums > 0) & (wanted > 0)
         ratio = np.divide(wanted, sums, out=np.ones(len(wanted)), where=live)
-        off = float(np.abs(ratio - 1.0).max(initial=0.0))
+        each = np.abs(ratio - 1.0)
+        off = float(wanted @ each / wanted.sum()) if over_area else float(each.max(initial=0.0))
         if off < to:
             break
         # A step leaves the square of what was off: to solve for it more closely would be wasted.

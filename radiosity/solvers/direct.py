@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from radiosity.form_factors._symmetric import SymmetricMatrix
 from radiosity.form_factors.bundle import ColumnFinder
 from radiosity.form_factors.matrix import CLOSED_TO, close_rows, exchange_areas
+from radiosity.solvers._slopes import Slopes
 from radiosity.solvers.lamps import lamp_irradiance, lamps_of_scene
 from radiosity.solvers.progressive import receive
 from radiosity.solvers.solution import Progress, ProgressEvent, Solution
+from workbench.geometry.flat import Geometry
 from workbench.shadow.occlusion import Shader
 
 __all__ = ["solve_direct", "solve_exchange", "solve_matrix"]
@@ -23,8 +25,10 @@ IntArray = NDArray[np.int64]
 COLUMNS_A_STEP = 32
 SOLVED_TO, MOST_STEPS = 1e-14, 2000
 """Relative residual at which the linear equations count as solved, and most steps towards it."""
+CORRECTED_TO = 1e-6
+"""The same of what slopes send, a small part of the light."""
 CLOSED_SHARE = 1e-3
-"""Error of a row sum that is left when rows are closed, over the wanted error of the form factors in it."""
+"""Share of the wanted error that rows which are not quite closed may make, over all reflections."""
 COVERED = 0.01
 """Share of an element of a closed scene that must see nothing to count as covered (the floor under a box)."""
 
@@ -73,7 +77,9 @@ def _told_apart(seen: FloatArray, area: FloatArray, closed: bool) -> FloatArray:
     return seen - (area @ seen) / area.sum() if closed else seen
 
 
-def _bounce(exchange: SymmetricMatrix, area: FloatArray, rho: FloatArray, before: FloatArray) -> FloatArray:
+def _bounce(
+    exchange: SymmetricMatrix, area: FloatArray, rho: FloatArray, before: FloatArray, to: float = SOLVED_TO
+) -> FloatArray:
     """Radiosity B of ``B = before + rho F B``, all bands at once, by conjugate gradients.
 
     Where rho > 0 the equations times area / rho are symmetric and positive definite; black elements
@@ -92,7 +98,7 @@ def _bounce(exchange: SymmetricMatrix, area: FloatArray, rho: FloatArray, before
     rest = wanted - times(x)
     z = rest / diagonal
     direction, power = z.copy(), (rest * z).sum(axis=0)
-    goal = SOLVED_TO**2 * (wanted * wanted / diagonal).sum(axis=0)
+    goal = to**2 * (wanted * wanted / diagonal).sum(axis=0)
     for _ in range(MOST_STEPS):
         if (power <= goal).all():
             break
@@ -116,6 +122,7 @@ def solve_exchange(
     *,
     closed: bool,
     closed_to: float = CLOSED_TO,
+    geometry: Geometry | None = None,
 ) -> FloatArray:
     """Solve for all light that is still to be exchanged, given the exchange areas between all elements.
 
@@ -130,7 +137,9 @@ def solve_exchange(
     closed : bool
         Whether the elements are an enclosure, so that rows are balanced.
     closed_to : float
-        Error of a row sum that may then be left.
+        Mean error of the row sums, over the area, that may then be left.
+    geometry : Geometry, optional
+        Of the scene: elements then send the slope of their radiosity, too, see :class:`Slopes`.
 
     Returns
     -------
@@ -150,7 +159,7 @@ def solve_exchange(
     visible = np.ones(n)
     if closed:
         visible = _visible_shares(exchange @ np.ones(n) / area, doubt)
-        change = exchange.scale_by(close_rows(exchange, area * visible, closed_to))
+        change = exchange.scale_by(close_rows(exchange, area * visible, closed_to, over_area=True))
         record.errors["row_balance_correction"] = change / scale
         record.results["covered_elements"] = int((visible < 1.0).sum())
     share = np.where(visible > 0, visible, 1.0)[:, None]
@@ -159,7 +168,13 @@ def solve_exchange(
     own = np.minimum(mesh.emission, unshot)
     before = own + (unshot - own) / share
     seen = _bounce(exchange, area[:, None] * share, mesh.reflectance, before)
-    arriving = (exchange @ seen) / area[:, None]
+    beside = np.zeros_like(seen)
+    if geometry is not None:
+        # Once is enough: what the slopes of the correction send is of a higher order.
+        beside = Slopes(mesh, geometry, sums > COVERED, area * share[:, 0]).sent(seen)
+        arrives = (exchange @ beside) / (area[:, None] * share)
+        seen += _bounce(exchange, area[:, None] * share, mesh.reflectance, mesh.reflectance * arrives, CORRECTED_TO)
+    arriving = (exchange @ (seen + beside)) / area[:, None]
     reflected = mesh.reflectance * arriving
     book = solution.book
     shot, received = area @ (unshot + reflected), area @ arriving
@@ -215,7 +230,8 @@ def solve_matrix(
         Whether the elements are an enclosure.
     coarse : Solution, optional
         The same scene, nothing shot, on a mesh whose elements are the patches of the solution's: solved too,
-        from the same exchange areas added up.  What differs is what the mesh leaves.
+        from the same exchange areas added up.  What differs is what the mesh leaves.  Both then send the slopes of
+        radiosity, too (:class:`radiosity.solvers._slopes.Slopes`).
     """
     mesh, record = solution.mesh, solution.record
     n, start = mesh.element_count, time.perf_counter()
@@ -225,7 +241,8 @@ def solve_matrix(
         if progress is not None:
             progress(ProgressEvent(0, 1.0 - done, 0.0, time.perf_counter() - start, "form factors"))
 
-    square, closed_to = np.zeros((2, mesh.bands)), CLOSED_SHARE * error
+    square = np.zeros((2, mesh.bands))
+    closed_to = max(CLOSED_SHARE * error * (1.0 - float(mesh.reflectance.max())), CLOSED_TO)
     lamps = lamps_of_scene(solution.scene, shader.geometry)
     try:
         report(0.0)
@@ -241,6 +258,8 @@ def solve_matrix(
                 light = lamp_irradiance(mesh, shader, lamps, record.counters, error=error, visible=visible, seed=seed)
     except KeyboardInterrupt:
         return
+    # A mesh that was asked for is solved as it is, with one radiosity an element, as by any other method.
+    sloped = shader.geometry if coarse is not None else None
     with record.stage("solve"):
         if lamps:
             _receive_lamps(solution, light.irradiance, light.elements)
@@ -251,8 +270,8 @@ def solve_matrix(
                 _receive_lamps(coarse, mesh.patch_mean(light.irradiance), emits)
             row_sums, doubts = (mesh.patch_mean(each[:, None])[:, 0] for each in (sums, doubt))
             summed = exchange.summed(mesh.patch_start)
-            solve_exchange(coarse, summed, row_sums, doubts, closed=closed, closed_to=closed_to)
-        seen = solve_exchange(solution, exchange, sums, doubt, closed=closed, closed_to=closed_to)
+            solve_exchange(coarse, summed, row_sums, doubts, closed=closed, closed_to=closed_to, geometry=sloped)
+        seen = solve_exchange(solution, exchange, sums, doubt, closed=closed, closed_to=closed_to, geometry=sloped)
         square[0] += spread @ _told_apart(seen, area, closed) ** 2 / area.sum()
     solution.state_irradiance_error(form_factors=square[0], visibility=square[1])
     record.errors["reciprocity"] = 0.0

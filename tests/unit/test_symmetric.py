@@ -78,6 +78,6 @@ def test_faces_of_a_narrow_gap_close_in_few_products():
             return kept @ x
 
     wanted[pair + 20] = wanted[pair]
-    x = close_rows(Counted(), wanted, 1e-6)
-    assert x * (kept @ x) == pytest.approx(wanted, rel=1.01e-6)
+    x = close_rows(Counted(), wanted, 1e-6, over_area=True)
+    assert np.abs(x * (kept @ x) - wanted).sum() < 1e-6 * wanted.sum()
     assert products < 200
