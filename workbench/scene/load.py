@@ -9,6 +9,7 @@ from pathlib import Path
 
 from workbench.errors import SceneError
 from workbench.scene.model import Scene
+from workbench.scene.overlaps import without_overlaps
 
 __all__ = ["SUFFIXES", "built_in_scenes", "load"]
 
@@ -25,6 +26,7 @@ _READERS = {
     ".nff": "workbench.scene.nff",
     ".rad": "workbench.scene.rad",
 }
+_AS_THEY_ARE = (".sc", ".nff")
 SUFFIXES = tuple(_READERS)
 """Suffixes of the files that :func:`load` reads."""
 
@@ -55,12 +57,13 @@ def load(path: str | Path | Scene) -> Scene:
     path : str, Path or Scene
         A file whose suffix is one of :data:`SUFFIXES` (in small or capital letters), or the name of
         a built-in scene such as ``"cornell-box"``; a file of that name comes first.  A scene is
-        handed back as it is, so that what takes a scene takes its name, too.
+        handed back, so that what takes a scene takes its name, too.
 
     Returns
     -------
     Scene
-        What the reader changed or supposed stands in its ``notes``.
+        What the reader changed or supposed stands in its ``notes``.  Where polygons lie on others in one plane, what
+        they hide is cut away (:mod:`workbench.scene.overlaps`), but for the files of ray casters (.sc, .nff).
 
     Raises
     ------
@@ -75,7 +78,7 @@ def load(path: str | Path | Scene) -> Scene:
     workbench.scene.mesh : what becomes of OBJ, PLY, STL, GLB and glTF files.
     """
     if isinstance(path, Scene):
-        return path
+        return without_overlaps(path)
     try:
         path = Path(path)
     except TypeError:
@@ -83,7 +86,8 @@ def load(path: str | Path | Scene) -> Scene:
     name = path.name.lower()
     suffix = next((known for known in sorted(_READERS, key=len, reverse=True) if name.endswith(known)), None)
     if suffix is not None:
-        return importlib.import_module(_READERS[suffix]).load_scene(path)
+        scene: Scene = importlib.import_module(_READERS[suffix]).load_scene(path)
+        return scene if suffix in _AS_THEY_ARE else without_overlaps(scene)
     built_in = _built_in_files()
     if str(path) in built_in and not path.is_file():
         return load(built_in[str(path)])
