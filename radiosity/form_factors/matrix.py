@@ -933,7 +933,7 @@ def _pair_seconds(mesh: _Elements, geometry: Geometry, rows: int, error: float) 
     """Processor seconds that pairs are expected to take.
 
     Pairs of few large polygons are refined behind most of the scene's planes, those of planes in many pieces seldom;
-    errors of many pieces in one row cancel.
+    errors of many pieces in one row cancel in part.
     """
     pieces = len(mesh.piece_element)
     pairs = 0.5 * pieces**2
@@ -948,7 +948,7 @@ def _pair_seconds(mesh: _Elements, geometry: Geometry, rows: int, error: float) 
         plane *= np.where(plane[np.arange(len(plane)), np.abs(normal).argmax(axis=1)] < 0, -1.0, 1.0)[:, None]
         planes = len(np.unique(np.round(1e6 * plane + 0.237), axis=0))
     planes = min(planes, MOST_PLANES)
-    refine = CLUTTER_SECONDS * planes * (0.01 / error) ** 0.9 * rows / pieces
+    refine = CLUTTER_SECONDS * planes * (0.01 / error) ** 0.9 * math.sqrt(rows / pieces)
     return prepare + pairs * (FEW_SECONDS + planes / pieces * (PLANE_SECONDS + refine))
 
 
