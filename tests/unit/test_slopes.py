@@ -43,7 +43,7 @@ def test_slopes_send_no_light_of_their_own(name):
     mesh, slopes = _slopes(name, 300)
     light = np.random.default_rng(3).random((mesh.element_count, 2))
     sent = slopes.sent(light)
-    assert np.abs(sent).max() > 0.01
+    assert 0.01 < np.abs(sent).max() < 1.0
     assert mesh.element_area @ sent == pytest.approx(np.zeros(2), abs=1e-12 * (mesh.element_area @ np.abs(sent)).max())
     assert slopes.sent(np.ones((mesh.element_count, 1))) == pytest.approx(np.zeros((mesh.element_count, 1)), abs=1e-12)
 
