@@ -25,7 +25,7 @@ from radiosity.patches import PatchMesh, small_facets
 from workbench.geometry.flat import Geometry
 from workbench.scene.model import Scene
 
-__all__ = ["NODE_SAMPLES", "Hierarchy", "TreeArrays"]
+__all__ = ["NODE_SAMPLES", "Hierarchy", "TreeArrays", "place_on_node"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -62,6 +62,7 @@ class TreeArrays(NamedTuple):
     corners: np.ndarray
     starts: np.ndarray
     piece_normal: np.ndarray
+    upto: np.ndarray
     samples: np.ndarray
     sample_normals: np.ndarray
 
@@ -190,6 +191,25 @@ def _describe_nodes(count, tree, piece_area, piece_centroid, piece_low, piece_hi
 
 
 @njit(nogil=True, cache=True)
+def place_on_node(node, tree, u, v, out):
+    """Point of a node at (u, v), uniform by area; returns its piece, found by the areas up to each."""
+    low, high = tree.piece0[node], tree.piece1[node] - 1
+    if low < high:
+        before = tree.upto[low]
+        goal = before + u * (tree.upto[high + 1] - before)
+        while low < high:
+            middle = (low + high) // 2
+            if tree.upto[middle + 1] > goal:
+                high = middle
+            else:
+                low = middle + 1
+        own = tree.upto[low + 1] - tree.upto[low]
+        u = min(max((goal - tree.upto[low]) / own, 0.0), 1.0) if own > 0.0 else 0.5
+        return place_on_pieces(tree.corners, tree.starts, low, low + 1, own, u, v, out)
+    return place_on_pieces(tree.corners, tree.starts, low, low + 1, tree.area[node], u, v, out)
+
+
+@njit(nogil=True, cache=True)
 def _sample_nodes(nodes, tree):
     """Points and normals that stand for equal parts of the area of each of ``nodes``."""
     for row in range(nodes.shape[0]):
@@ -197,9 +217,7 @@ def _sample_nodes(nodes, tree):
         tree.sample[n] = row
         for k in range(NODE_SAMPLES):
             u, v = (k + 0.5) / NODE_SAMPLES, (k * 0.6180339887498949 + 0.5) % 1.0
-            piece = place_on_pieces(
-                tree.corners, tree.starts, tree.piece0[n], tree.piece1[n], tree.area[n], u, v, tree.samples[row, k]
-            )
+            piece = place_on_node(n, tree, u, v, tree.samples[row, k])
             for axis in range(3):
                 tree.sample_normals[row, k, axis] = tree.piece_normal[piece, axis]
 
@@ -305,6 +323,7 @@ def _split_cells(nodes, tree, node, piece):
                 cy += part * (out[0, 1] + out[t + 1, 1] + out[t + 2, 1]) / 3.0
                 cz += part * (out[0, 2] + out[t + 1, 2] + out[t + 2, 2]) / 3.0
             tree.area[node] = total
+            tree.upto[piece + 1] = tree.upto[piece] + total
             tree.centroid[node, 0], tree.centroid[node, 1], tree.centroid[node, 2] = cx / total, cy / total, cz / total
             square = 0.0
             for c in range(size):
@@ -598,6 +617,7 @@ class Hierarchy:
         area = np.empty(len(owner))
         centroid, low, high = np.empty((len(owner), 3)), np.empty((len(owner), 3)), np.empty((len(owner), 3))
         _describe_pieces(0, len(owner), corners, starts, area, centroid, low, high)
+        tree.upto[1 : len(owner) + 1] = np.cumsum(area)
         _describe_nodes(count, tree, area, centroid, low, high)
         sampled = np.flatnonzero(tree.piece1[:count] - tree.piece0[:count] > 1)
         self._samples = np.zeros((max(len(sampled), 1), NODE_SAMPLES, 3))
@@ -690,6 +710,7 @@ class Hierarchy:
         self._fields["corners"] = np.zeros((corner_room, 3))
         self._fields["starts"] = np.zeros(piece_room + 1, dtype=np.int64)
         self._fields["piece_normal"] = np.zeros((piece_room, 3))
+        self._fields["upto"] = np.zeros(piece_room + 1)
         self._fields["samples"] = np.zeros((1, NODE_SAMPLES, 3))
         self._fields["sample_normals"] = np.zeros((1, NODE_SAMPLES, 3))
         self._refresh()
@@ -704,6 +725,7 @@ class Hierarchy:
             "corners": corners + 4 * nodes,
             "starts": self.piece_count + nodes + 1,
             "piece_normal": self.piece_count + nodes,
+            "upto": self.piece_count + nodes + 1,
         }
         for name, old in self._fields.items():
             wanted = room.get(name, self.node_count + nodes)

@@ -21,9 +21,9 @@ from radiosity.form_factors._links import (
     _sampled_share,
     open_share,
 )
-from radiosity.form_factors._sampling import place_on_pieces, stream
+from radiosity.form_factors._sampling import stream
 from radiosity.form_factors.analytic import pair_exchange
-from radiosity.hierarchy import NODE_SAMPLES
+from radiosity.hierarchy import NODE_SAMPLES, place_on_node
 from workbench.accel.box_tree import boxes_meeting_planes
 from workbench.culling.hull_shaft import hull_shaft
 from workbench.culling.plane_vertex import outside_planes
@@ -733,14 +733,8 @@ def pair_rays(
         soft = min(tree.area[x], tree.area[y]) / (math.pi * counts[i])
         for k in range(counts[i]):
             t = k + 0.5
-            own = place_on_pieces(
-                tree.corners, tree.starts, tree.piece0[x], tree.piece1[x], tree.area[x], (s1 + t / g) % 1.0,
-                (s2 + t / g**2) % 1.0, p,
-            )  # fmt: skip
-            other = place_on_pieces(
-                tree.corners, tree.starts, tree.piece0[y], tree.piece1[y], tree.area[y], (s3 + t / g**3) % 1.0,
-                (s4 + t / g**4) % 1.0, q,
-            )  # fmt: skip
+            own = place_on_node(x, tree, (s1 + t / g) % 1.0, (s2 + t / g**2) % 1.0, p)
+            other = place_on_node(y, tree, (s3 + t / g**3) % 1.0, (s4 + t / g**4) % 1.0, q)
             n, m = tree.piece_normal[own], tree.piece_normal[other]
             dx, dy, dz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
             cx = dx * n[0] + dy * n[1] + dz * n[2]

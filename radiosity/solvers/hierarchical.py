@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from radiosity.form_factors._links import occluder_arrays, workspace
 from radiosity.hierarchy import Hierarchy
+from radiosity.patches import PatchMesh
 from radiosity.solvers._pairs import (
     CLEAR,
     CUT,
@@ -127,6 +128,8 @@ LEAST_COVER_POINTS, MOST_COVER_POINTS, ALL_COVER_POINTS = 8, 256, 2**14
 """Points of an element, and of all surfaces: few points of few elements made the bare area of a room 1 % too large."""
 PAIR_BYTES = 220
 """Memory that a new pair takes while it is measured, and as a link with both its directions."""
+OUTSIDE = 3.0
+"""What the light from outside may be off, over the link error, of which a solve leaves some tens; or over 1 / n."""
 SMALLEST = 2.0**-14
 """Shortest edge that is split by default, as a share of the scene's size."""
 
@@ -327,10 +330,12 @@ class _Solver:
         min_edge: float,
         direct_in_mesh: bool,
         relative: float,
+        outside_error: float,
         workers: int,
         seed: int,
         max_elements: int | None,
     ) -> None:
+        self.outside_error = outside_error
         self.scene, self.geometry, self.record = scene, geometry, record
         self.min_edge, self.direct_in_mesh, self.relative, self.seed = min_edge, direct_in_mesh, relative, seed
         self.max_elements = max_elements
@@ -695,7 +700,13 @@ class _Solver:
 
     def incident(self, nodes: IntArray) -> FloatArray:
         """Irradiance (k, bands) of nodes from lights without surface and from the sky."""
-        return self._from_outside("mean", incident_irradiance, nodes)
+
+        def find(scene: Scene, mesh: PatchMesh, *args: Any, **options: Any) -> FloatArray:
+            # A few fresh nodes may be off by more: the error is that over all surfaces.
+            error = self.outside_error * math.sqrt(self.total_area / max(float(mesh.element_area.sum()), 1e-300))
+            return incident_irradiance(scene, mesh, *args, error=error, **options)
+
+        return self._from_outside("mean", find, nodes)
 
     def _from_outside(self, name: str, find: Callable[..., FloatArray], nodes: IntArray) -> FloatArray:
         """What ``find`` says of the light from outside the mesh on each node, asked once."""
@@ -1024,6 +1035,7 @@ def solve_hierarchical(
         min_edge=min_edge if min_edge is not None else SMALLEST * geometry.size,
         direct_in_mesh=direct_in_mesh,
         relative=form_factor_error or 0.0,
+        outside_error=OUTSIDE * (link_error or 1.0 / float(max_elements or 1)),
         workers=workers,
         seed=seed,
         max_elements=max_elements,

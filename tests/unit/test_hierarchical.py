@@ -16,8 +16,9 @@ from radiosity.accuracy import surface_points
 from radiosity.element_lookup import ElementLookup
 from radiosity.form_factors.analytic import point_to_polygon
 from radiosity.hierarchy import Hierarchy
-from radiosity.solvers import hierarchical
+from radiosity.solvers import hierarchical, incident
 from workbench import memory
+from workbench.accel.embree import EmbreeAccelerator
 from workbench.errors import InputError, MemoryForecastError, OptionError
 from workbench.geometry.flat import Geometry
 from workbench.record import RunRecord
@@ -642,3 +643,26 @@ def test_where_links_have_nothing_to_refine_the_error_asked_is_reached():
     solution = radiosity.solve(unit_cube(0.8, 1.0), method="hierarchical", error=0.01, workers=1)
     assert solution.converged and solution.record.errors["estimate"]["total"] < 0.01
     assert np.abs(solution.element_irradiance - 5.0).max() < 0.01 * 5.0
+
+
+def test_the_sky_is_asked_no_more_than_the_elements_are_worth(monkeypatch):
+    # Asked without an error, each batch of new nodes got all the points there may be: most of the time of a solve.
+    asked = []
+    find = incident._from_sky
+
+    def counted(mesh, rows, count, *rest):
+        asked.append(len(rows) * count)
+        return find(mesh, rows, count, *rest)
+
+    monkeypatch.setattr(incident, "_from_sky", counted)
+    room = box_surface("room", diffuse("wall", 0.5), *UNIT, inward=True, omit=["+z"])
+    blind = box_surface("blind", diffuse("blind", 0.5), [0.2, 0.2, 0.7], [0.7, 0.8, 0.72])
+    scene = Scene("open", (room, blind), bands=1, background=np.ones(1))
+    solution = solve(scene, elements=100, direct_in_mesh=False)
+    assert sum(asked) < 12_000
+    mesh = solution.mesh
+    exact = incident.incident_irradiance(scene, mesh, EmbreeAccelerator(Geometry.from_scene(scene)))
+    found, wanted = (
+        mesh.element_area @ each[:, 0] / mesh.element_area.sum() for each in (solution.direct_irradiance, exact)
+    )
+    assert found == pytest.approx(wanted, rel=0.005)
