@@ -165,17 +165,20 @@ def test_both_sides_of_a_sheet_and_a_black_back(by_rays):
 
 
 def test_what_no_ray_met_keeps_the_doubt_of_hits(by_rays):
-    # A speck of a millionth of the area of the floor below it; rays from it find the floor, but not each speck another.
-    speck = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0]], dtype=float) * 1e-3
-    low = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
-    found = by_rays(polygon_scene(low, speck + [0.2, 0.2, 0.5], low[::-1] * [1, 1, 0] + [0, 0, 5]), error=0.05)
+    # Two specks that face each other over 2: rays from one never find the other, whose share is 1e-7.
+    speck = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=float) * 1e-3
+    floor = np.array([[0, 0, -1], [1, 0, -1], [1, 1, -1], [0, 1, -1]], dtype=float)
+    away = speck[::-1] + [0.2, 0.2, 0.0]  # its back is the first speck's: it faces the floor only
+    found = by_rays(polygon_scene(floor, speck + [0.5, 0.5, 0.0], speck[::-1] + [0.5, 0.5, 2.0], away), error=0.05)
     factor, error = found.dense(), errors_of(found)
-    rays = found.record.results["rays_a_row"]
-    assert factor[1, 0] > 0.3
-    # From above the speck is a back; it faces the floor only, and nothing on the diagonal is possible.
-    assert (np.diag(error) == 0).all() and error[1, 2] == 0
-    hit = 1.0 / (rays * (1 / found.areas[0] + 1 / found.areas[1]))
-    assert error[0, 1] * found.areas[0] >= hit * (1 - 1e-6)
+    hit = 1.0 / (found.record.results["rays_a_row"] * (1 / found.areas[1] + 1 / found.areas[2]))
+    assert factor[1, 2] == 0 < error[1, 2]
+    assert error[1, 2] * found.areas[1] >= hit * (1 - 1e-6)
+    true = found.areas[2] / (np.pi * 2.0**2)
+    assert true < error[1, 2]
+    # Of what cannot be nothing is doubted: a polygon and itself, and backs.
+    assert (np.diag(error) == 0).all() and error[1, 0] == error[1, 3] == error[3, 2] == 0
+    assert factor[3, 0] > 0.1  # while what rays met is known
 
 
 def test_covered_floor_keeps_what_it_sees_by_rays(by_rays):

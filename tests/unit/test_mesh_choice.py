@@ -42,14 +42,14 @@ def test_the_mesh_is_as_fine_as_it_was_told_and_no_finer(name, wanted):
     coarse = like_elements(mesh.patch_area, mesh.patch_mean(mesh.reflectance).mean(axis=1))
     assert fine >= 2.0 * coarse
     # Lines along which things stand on a floor cut some elements more.
-    assert mesh.element_count <= max(2.2 * wanted, 1.4 * geometry.polygon_count + 30)
+    assert mesh.element_count <= max(1.4 * wanted, 1.2 * geometry.polygon_count + 30)
 
 
 @pytest.mark.parametrize("error", [0.1, 0.05, 0.02])
 @pytest.mark.parametrize("name", ["cornell-box", "office", "l-room", "daylight-office", "hinged-blocker"])
-def test_meshes_on_the_way_cost_less_than_the_last(name, error):
+def test_meshes_on_the_way_are_few_and_cost_less_than_the_last(name, error):
     """Counted, not timed: the seconds of a full matrix grow with the power 1.7 of its elements."""
     record = radiosity.solve(workbench.load(name), error=error).record
     work = [level["elements"] ** 1.7 for level in record.results["levels"]]
     assert record.results["target_reached"]
-    assert sum(work[:-1]) < 0.75 * work[-1]
+    assert len(work) <= 2 and sum(work[:-1]) < 0.7 * work[-1]
