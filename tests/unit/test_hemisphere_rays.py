@@ -212,3 +212,20 @@ def test_panes_keep_their_pairs(by_rays):
     sheet = grid("pane", [0, 0, 0.5], [1, 0, 0], [0, 1, 0], 1, pane)
     found = radiosity.view_factors(Scene("pane", (FACING[0], sheet), bands=1), by="surface", error=0.1)
     assert found.record.results["method"] == "pairs"
+
+
+def test_pairs_behind_hundreds_of_polygons_agree_with_rays(by_rays, monkeypatch):
+    # 250 small triangles between two squares: more than are looked at one by one, and sifted for none of these pairs.
+    rng = np.random.default_rng(8)
+    rings = [FACING[0].face(0)[0] * 50, FACING[0].face(0)[0][::-1] * 50 + [0, 0, 1]]
+    for _ in range(250):
+        rings.append(0.04 * rng.normal(size=(3, 3)) + [*rng.uniform(0.1, 0.9, 2), rng.uniform(0.3, 0.7)])
+    scene = polygon_scene(*rings)
+    rays = by_rays(scene, error=0.03, workers=2)
+    monkeypatch.setattr(matrix, "_pair_seconds", lambda *_: 0.0)
+    pairs = radiosity.view_factors(scene, error=0.1, workers=2)
+    assert pairs.record.results["method"] == "pairs" and pairs.record.counters["rays"] > 0
+    off, doubt = (m.dense()[0, 1] for m in (pairs, rays)), np.hypot(errors_of(pairs)[0, 1], errors_of(rays)[0, 1])
+    assert abs(np.subtract(*off)) < 4 * doubt < 0.1
+    assert rays.dense()[0, 1] < 0.8 * HOWELL_C11
+    assert np.abs(pairs.dense() - rays.dense()).sum(axis=1).mean() < 0.13
