@@ -44,6 +44,7 @@ from workbench.arrays import as_fraction, as_places, as_positive
 from workbench.counters import Counters
 from workbench.errors import InputError, MemoryForecastError, OptionError
 from workbench.geometry.flat import Geometry
+from workbench.record import RunRecord
 from workbench.scene.load import load
 from workbench.scene.model import Scene
 from workbench.shadow.occlusion import Shader
@@ -99,8 +100,15 @@ GATHERED = 5.0
 """Number of elements times the sum of squared form factors from a point to them: 1 in a sphere, 3 to 6 in rooms."""
 LINK_ORDER = 0.6
 """Order of hierarchical solves: links are found as well as elements are, and miss what falls slowly."""
+FIRST_LINKS = 0.4
+"""Link error of the first links, over the asked error (seen on rooms)."""
+COARSER_BY, MOST_TRUSTED = 1.5, 3.0
+"""Least ratio of the elements of links to those that they are compared with, where there are such; and the largest that
+is trusted to make them better."""
 LINKS_ERROR = 0.02
 """Larger scenes are solved by links, which are cheapest from so large an asked error on, and else by shooting."""
+LINKS_CHEAPER = 0.75
+"""Links, whose error is known less well, are taken where they are expected to cost so much less."""
 MOST_LEVELS = 12
 TWICE_ELEMENTS = 64
 """Meshes up to this size are solved twice, to see a difference."""
@@ -359,6 +367,9 @@ def _finish(run: _Run, solution: Solution, estimate: ErrorEstimate, reason: str)
     )
     record.results["levels"] = run.levels
     record.results.pop("level_irradiance", None)
+    record.results.pop("rounds_seen", None)
+    if solution.stopped != "interrupted":
+        solution.refinement = None
     reached = run.target > 0 and estimate.total <= run.target
     record.results["target_reached"] = reached
     record.choices |= run.choices | {"stop": reason}
@@ -375,10 +386,10 @@ def _look(gatherer: Gatherer, where: tuple[FloatArray, FloatArray, IntArray], ro
     """Indirect irradiance (looks, points, bands) at points, by the same rays for every solution."""
     _, _, rays, looks = LOOKS[row]
     points, normals, _ = where
-    seeds = range(1, looks + 1)
-    return np.array(
-        [gatherer.indirect(points, normals, rays=rays, counters=run.counters, seed=k).indirect for k in seeds]
-    )
+    # In one call: each place has rays of its own.
+    here, facing = (np.tile(each, (looks, 1)) for each in (points, normals))
+    found = gatherer.indirect(here, facing, rays=rays, counters=run.counters, seed=1).indirect
+    return found.reshape(looks, len(points), -1)
 
 
 def _effort(run: _Run, elements: int) -> int:
@@ -420,12 +431,12 @@ def _method(scene: Scene, run: _Run) -> str:
     if polygons <= MATRIX_POLYGONS:
         run.choices["method"] = f"matrix: {polygons} polygons, all form factors at once up to {MATRIX_POLYGONS}"
         if rough and polygons:
-            pieces, need = len(Geometry.from_scene(scene).piece_start) - 1, _first_count(run)
-            size = {"polygons": polygons, "pieces": pieces}
-            whole = expected_seconds("matrix", **size, elements=max(need, polygons))
-            # By links a second mesh shows what the first one leaves.
-            links = sum(expected_seconds("hierarchical", **size, elements=n) for n in (need, FIRST_GROWTH * need))
-            method = "hierarchical" if links < whole else "matrix"
+            pieces, error = len(Geometry.from_scene(scene).piece_start) - 1, _first_error(run)
+            whole, links = (
+                expected_seconds(each, polygons=polygons, pieces=pieces, error=error)
+                for each in ("matrix", "hierarchical")
+            )
+            method = "hierarchical" if links < LINKS_CHEAPER * whole else "matrix"
             told = f"{whole:.2g} s expected of the full matrix, {links:.2g} s of links"
             run.choices["method"] = f"{method}: {polygons} polygons in {pieces} pieces, {told}"
             return method
@@ -608,38 +619,39 @@ class _Meshes:
             solution.record.results["level_irradiance"] = None if self.seen is None else self.seen.tolist()
             self.checkpoint(solution)
 
-        asked = run.options | {
-            "method": self.method,
-            "elements": count,
-            "tolerance": min(0.1 * finest, 0.01) / max(run.scale, 1.0),
-            "form_factor_error": min(run.care * 2.0 * finest, 0.02),
-        }
-        if self.method == "hierarchical":
-            # Links are found as well as their elements need; the points take direct light themselves.
-            del asked["form_factor_error"]
-            asked["direct_in_mesh"] = False
         return solve_once(
             self.scene,
             progress=_watched(self.progress, run, f"mesh {len(run.levels) + 1}, about {count} elements", stoppable),
             checkpoint=None if self.checkpoint is None else keep,
             resume=unfinished,
-            **asked,
+            method=self.method,
+            elements=count,
+            tolerance=min(0.1 * finest, 0.01) / max(run.scale, 1.0),
+            form_factor_error=min(run.care * 2.0 * finest, 0.02),
+            **{name: value for name, value in run.options.items() if name != "method"},
         )
 
     def compare(self, solution: Solution) -> tuple[float | None, float]:
         """What the mesh and the one before differ by, and how many elements alike that is as good as."""
-        if self.gatherer is None:
-            self.gatherer = Gatherer(solution, workers=self.run.options.get("workers"))
-            # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
-            self.points = self.run.points(build_mesh(self.scene, self.gatherer.geometry), self._row())
-        assert self.points is not None
-        reading = self.gatherer.reading(solution)
-        mean = self.run.measure(solution, reading)
-        seen = _look(reading, self.points, self._row(), self.run)
+        reading, mean = self._reading(solution)
+        seen = self._look(reading)
         before, self.seen = self.seen, seen
         if before is None:
             return None, 0.0
         return _difference(seen, before, mean)[0], self.run.levels[-1]["like"]
+
+    def _reading(self, solution: Solution) -> tuple[Gatherer, float]:
+        """What reads a solution, and the mean irradiance."""
+        if self.gatherer is None:
+            self.gatherer = Gatherer(solution, workers=self.run.options.get("workers"))
+            # Of the coarsest mesh, so that they do not depend on where a resumed run begins.
+            self.points = self.run.points(build_mesh(self.scene, self.gatherer.geometry), self._row())
+        reading = self.gatherer.reading(solution)
+        return reading, self.run.measure(solution, reading)
+
+    def _look(self, reading: Gatherer) -> FloatArray:
+        assert self.points is not None
+        return _look(reading, self.points, self._row(), self.run)
 
     def _row(self) -> int:
         """Row of :data:`LOOKS`, one for all meshes: they are compared at the same points."""
@@ -657,6 +669,117 @@ class _Meshes:
         """These methods save themselves within each mesh."""
 
 
+@dataclass(eq=False)
+class _Seen:
+    """A solution of a round of links, or what was seen of it: indirect light at points, flux that surfaces reflect."""
+
+    elements: int
+    solution: Solution | None
+    looks: FloatArray | None = None
+    surfaces: FloatArray | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the record of an unfinished solve."""
+        assert self.looks is not None and self.surfaces is not None
+        return {"elements": self.elements, "looks": self.looks.tolist(), "surfaces": self.surfaces.tolist()}
+
+
+class _Links(_Meshes):
+    """Links made finer and finer, each time going on from those that are there.
+
+    The rounds in which links are refined are compared with the last one: no mesh is solved for that alone.
+    The ``count`` of this class is the inverse of the link error.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        run: _Run,
+        method: str,
+        progress: Progress | None,
+        checkpoint: Checkpoint | None,
+        resume: Solution | None,
+    ) -> None:
+        super().__init__(scene, run, method, progress, checkpoint, resume)
+        stored = [] if resume is None else resume.record.results.get("rounds_seen", [])
+        self.rounds = [_Seen(e["elements"], None, np.asarray(e["looks"]), np.asarray(e["surfaces"])) for e in stored]
+
+    def first(self) -> int:
+        """Inverse of the first link error."""
+        self.run.guess = 1.0 / (FIRST_LINKS * _first_error(self.run))
+        return math.ceil(self.run.guess)
+
+    def solve(self, count: int, stoppable: bool) -> Solution:
+        """Refine until links are off by no more than the inverse of ``count``."""
+        run = self.run
+        unfinished, self.unfinished = self.unfinished, None
+
+        def keep(solution: Solution) -> None:
+            assert self.checkpoint is not None
+            solution.record.settings |= run.settings | {"elements": count}
+            solution.record.results["levels"] = run.levels
+            solution.record.results["rounds_seen"] = [self._seen(each).as_dict() for each in self.rounds]
+            self.checkpoint(solution)
+
+        solution = solve_once(
+            self.scene,
+            progress=_watched(self.progress, run, f"mesh {len(run.levels) + 1}, links to {1 / count:.2g}", stoppable),
+            checkpoint=None if self.checkpoint is None else keep,
+            resume=unfinished,
+            rounds=lambda each: self.rounds.append(_Seen(each.mesh.element_count, each)),
+            method=self.method,
+            link_error=1.0 / count,
+            tolerance=min(0.1 * run.target, 0.01) / max(run.scale, 1.0) if run.target > 0 else 0.001,
+            **{name: value for name, value in run.options.items() if name != "method"},
+        )
+        if solution.stopped != "interrupted":
+            # The last round's, solved to the end.
+            self.rounds[-1:] = [_Seen(solution.mesh.element_count, solution)]
+        # Counters and seconds of what is gone on from are those of this solve already.
+        self.unfinished = replace(solution, record=RunRecord("solve", dict(solution.record.settings)))
+        return solution
+
+    def compare(self, solution: Solution) -> tuple[float | None, float]:
+        """What the links and those of a round before differ by, and how many elements those are as good as."""
+        n = solution.mesh.element_count
+        # The first two rounds hold the light of emitters, and of what they lit.
+        whole = self.rounds[0 if self.run.levels else 2 : -1]
+        if not whole:
+            return None, 0.0
+        fewer = [each for each in whole if COARSER_BY * each.elements <= n]
+        chosen = fewer[-1] if fewer else whole[0]
+        # Later ones are compared with no coarser ones.
+        self.rounds = self.rounds[self.rounds.index(chosen) :]
+        levels = self.run.levels
+        if n < LEAST_GROWTH * chosen.elements and not (levels and levels[-1]["difference"] is None):
+            # Links alone were refined: that elements will do as they are is believed when told twice.
+            return None, 0.0
+        before, last = self._seen(chosen), self._seen(self.rounds[-1])
+        assert before.looks is not None and last.looks is not None
+        mean = self._reading(solution)[1]
+        difference = _difference(last.looks, before.looks, mean)[0]
+        if self.run.at is None:
+            assert before.surfaces is not None and last.surfaces is not None
+            off = np.sqrt(((last.surfaces - before.surfaces) ** 2).mean(axis=1)).sum()
+            difference = max(difference, float(off / solution.mesh.element_area.sum()) / mean) if mean > 0 else 0.0
+        return difference, max(float(before.elements), n / MOST_TRUSTED)
+
+    def _seen(self, one: _Seen) -> _Seen:
+        """What was seen of a round, looked at if it was not yet."""
+        if one.looks is None:
+            solution = one.solution
+            assert solution is not None
+            one.looks = self._look(self._reading(solution)[0])
+            mesh = solution.mesh
+            flux = mesh.element_area[:, None] * mesh.reflectance * solution.element_irradiance
+            one.surfaces = np.stack([np.bincount(mesh.element_surface, band) for band in flux.T], axis=1)
+        return one
+
+    def finer(self, solution: Solution, times: float) -> int:
+        """Inverse of a link error so many times smaller."""
+        return math.ceil(times / solution.record.settings["link_error"])
+
+
 def _refine(
     scene: Scene, run: _Run, progress: Progress | None, checkpoint: Checkpoint | None, resume: Solution | None
 ) -> Solution:
@@ -668,7 +791,8 @@ def _refine(
     if method == "matrix":
         levels = _Patches(scene, run, progress, checkpoint)
     else:
-        levels = _Meshes(scene, run, method, progress, checkpoint, resume)
+        kind = _Links if method == "hierarchical" else _Meshes
+        levels = kind(scene, run, method, progress, checkpoint, resume)
     count = levels.first()
     if resume is not None:
         run.levels = list(resume.record.results.get("levels", []))
@@ -689,12 +813,10 @@ def _refine(
             best.stopped = best.stopped if run.left < 0 else "interrupted"
             return _finish(run, best, estimate, reason)
         n = solution.mesh.element_count
-        if run.levels and n < LEAST_GROWTH * run.levels[-1]["elements"]:
+        if method != "hierarchical" and run.levels and n < LEAST_GROWTH * run.levels[-1]["elements"]:
             # Clusters of facets come in steps: as good as the same mesh tells nothing.
             if stuck >= MOST_STUCK:
-                # Links with nothing left to refine know what they are off.
-                left = solution.record.errors.get("link_error_estimate", {}).get("total", math.inf)
-                return _finish(run, solution, _parts(solution, left, run.scale), "no finer mesh can be made")
+                return _finish(run, solution, _parts(solution, math.inf, run.scale), "no finer mesh can be made")
             stuck, count = stuck + 1, 2 * count
             continue
         start = time.perf_counter()
@@ -711,11 +833,7 @@ def _refine(
         if difference == 0.0:
             meshing = 0.0
         elif difference is not None:
-            growth = like / coarse
-            if method == "hierarchical":
-                # Links are as coarse as the elements are few, however alike these are.
-                growth = min(growth, n / run.levels[-2]["elements"])
-            meshing = difference / (max(growth, LEAST_GROWTH) ** order - 1.0)
+            meshing = difference / (max(like / coarse, LEAST_GROWTH) ** order - 1.0)
         estimate = _parts(solution, meshing, run.scale)
         now = time.perf_counter()
         run.spent["error estimate"] = run.spent.get("error estimate", 0.0) + now - start

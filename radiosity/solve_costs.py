@@ -1,4 +1,4 @@
-"""What a solve will cost, told before it is made: by method, from numbers of polygons, pieces and elements.
+"""What a solve will cost, told before it is made: by method, from numbers of polygons and pieces and the asked error.
 
 The committed table holds processor seconds of one machine; only their ratios decide.  It is fitted to runs
 by ``python tests/speed/fit_solve_costs.py``.
@@ -7,6 +7,7 @@ by ``python tests/speed/fit_solve_costs.py``.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -19,27 +20,30 @@ from workbench.errors import InputError
 
 __all__ = ["TABLE", "expected_seconds", "features", "fit", "read_table"]
 
+FIRST_ELEMENTS = 5.0
+"""Elements of the first mesh, times the asked error, about."""
 TABLE = Path(__file__).with_name("solve_costs.json")
 """Method to the seconds of each of its features."""
 
 
-def features(method: str, *, polygons: int, pieces: int, elements: int) -> dict[str, float]:
-    """What the seconds of a method go with.
+def features(method: str, *, polygons: int, pieces: int, error: float) -> dict[str, float]:
+    """What the seconds of a method go with, when an error is asked.
 
     Parameters
     ----------
     method : str
-        ``matrix`` (pairs of convex pieces) or ``hierarchical`` (polygons, which make the tree; elements, whose links
-        are refined).
+        ``matrix`` (pairs of convex pieces) or ``hierarchical`` (polygons, which make the tree; links, which grow with
+        them and with what is asked).
     polygons, pieces : int
         Of the scene: polygons, and the convex pieces that they are cut into.
-    elements : int
-        Of the mesh.
+    error : float
+        Asked.
     """
     if method == "matrix":
-        # Each piece is at least an element's, however coarse the mesh.
-        return {"start": 1.0, "pair": 0.5 * float(max(pieces, elements + pieces - polygons)) ** 2}
-    return {"start": 1.0, "polygon": float(polygons), "element": float(elements)}
+        # Each piece is at least an element's, however coarse the mesh; any polygon may hide some of a pair.
+        pairs = 0.5 * (pieces + FIRST_ELEMENTS / error) ** 2
+        return {"start": 1.0, "polygon": float(polygons), "hidden": polygons * pairs}
+    return {"start": 1.0, "polygon": float(polygons), "link": math.sqrt(polygons) / error}
 
 
 def fit(rows: Sequence[tuple[Mapping[str, float], float]]) -> dict[str, float]:
@@ -68,10 +72,9 @@ def read_table(path: Path = TABLE) -> dict[str, dict[str, float]]:
         raise InputError(f"{path}: found no table of costs ({problem})") from None
 
 
-def expected_seconds(method: str, *, polygons: int, pieces: int, elements: int) -> float:
+def expected_seconds(method: str, *, polygons: int, pieces: int, error: float) -> float:
     """Processor seconds of a solve on the machine of the table; see :func:`features`."""
     row = read_table()[method]
     return sum(
-        row[name] * count
-        for name, count in features(method, polygons=polygons, pieces=pieces, elements=elements).items()
+        row[name] * count for name, count in features(method, polygons=polygons, pieces=pieces, error=error).items()
     )

@@ -408,7 +408,7 @@ class _Solver:
             tree.restore(split, opened)
             self.links = _Links(*(state[f.name] for f in fields(_Links)))
             for name in _NODE_VALUES:
-                setattr(self, name, state[name])
+                setattr(self, name, state[name].copy())
             self.candidates, self._bare = state["candidates"], state["bare"]
             self._outside = {name: state[f"outside_{name}"] for name in self._outside}
             done, error, *unit = state["round"].tolist()
@@ -959,6 +959,7 @@ def solve_hierarchical(
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
     resume: Solution | None = None,
+    rounds: Callable[[Solution], None] | None = None,
 ) -> Solution:
     """Solve a scene over a hierarchy of links.
 
@@ -1003,6 +1004,9 @@ def solve_hierarchical(
     resume : Solution, optional
         Such a solution, or one that was interrupted, to go on from; gone on from the former, the answer is
         that of an unbroken solve, bit for bit.  One that was finished is solved anew.
+    rounds : callable, optional
+        Called with the solution after each round of refinement, from coarse to fine; the one that is returned then
+        keeps what is needed to go on from it with more elements.
 
     Returns
     -------
@@ -1048,7 +1052,7 @@ def solve_hierarchical(
             solver.divide(max_edge)
         if form_factor_error is None and (max_elements or math.inf) <= solver.tree.leaf_count <= EXACT_ELEMENTS:
             solver.relative = EXACT
-        return _rounds(solver, state, link_error, tolerance, progress, checkpoint)
+        return _rounds(solver, state, link_error, tolerance, progress, checkpoint, rounds)
     finally:
         solver.close()
 
@@ -1090,6 +1094,7 @@ def _rounds(
     tolerance: float,
     progress: Progress | None,
     checkpoint: Checkpoint | None,
+    each_round: Callable[[Solution], None] | None,
 ) -> Solution:
     """Refine and solve, round by round."""
     record, tree = solver.record, solver.tree
@@ -1130,6 +1135,8 @@ def _rounds(
         if stopped:
             break
         state.done += 1
+        if each_round is not None:
+            each_round(solution)
         if checkpoint is not None and time.perf_counter() - saved > pause:
             start = time.perf_counter()
             solver.count()
@@ -1149,7 +1156,7 @@ def _rounds(
                 break
     solution.converged = not stopped
     solution.stopped = stopped or "tolerance"
-    if stopped:
+    if stopped or each_round is not None:
         solution.refinement = solver.state(state)
     _report(solver, solution, exchange)
     return solution

@@ -220,6 +220,7 @@ def solve(
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
     resume: Solution | None = None,
+    rounds: Callable[[Solution], None] | None = None,
     **options: Unpack[SolveOptions],
 ) -> Solution:
     """Solve a scene for radiosity.
@@ -264,6 +265,9 @@ def solve(
         Called now and then with the unfinished solution, for instance to save it.
     resume : Solution, optional
         An earlier solution of the same scene and mesh to go on from.
+    rounds : callable, optional
+        Of ``hierarchical``: called with the solution after each round of refinement; the one that is returned can then
+        be gone on from with more elements.
 
     Returns
     -------
@@ -305,6 +309,7 @@ def solve(
             progress=progress,
             checkpoint=checkpoint,
             resume=resume,
+            rounds=rounds,
         )
     if method == "auto":
         method = _chosen(scene, geometry, record, resume)

@@ -104,9 +104,10 @@ def test_a_given_mesh_is_kept():
     assert np.sqrt((off**2).mean()) < 1e-3
 
 
-def test_an_interrupted_refinement_leaves_the_last_whole_mesh_and_goes_on_to_the_same(tmp_path):
+@pytest.mark.parametrize(("method", "error"), [("progressive", 0.01), ("hierarchical", 0.003)])
+def test_an_interrupted_refinement_leaves_the_last_whole_mesh_and_goes_on_to_the_same(tmp_path, method, error):
     scene = cube_with_emitter(0.5, 0.5)
-    options = {"error": 0.01, "workers": 1, "method": "progressive"}
+    options = {"error": error, "workers": 1, "method": method}
     whole = radiosity.solve(scene, **options)
 
     class KilledError(Exception):

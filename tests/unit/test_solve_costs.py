@@ -13,10 +13,10 @@ from workbench.scene.model import Scene, Surface
 
 
 def test_a_fit_finds_the_costs_that_made_the_runs():
-    truth = {"start": 0.03, "pair": 2e-6}
+    truth = {"start": 0.03, "polygon": 1e-3, "hidden": 2e-8}
     rows = []
-    for elements in (20, 100, 500, 2000):
-        row = features("matrix", polygons=10, pieces=12, elements=elements)
+    for polygons, error in ((8, 0.1), (10, 0.05), (100, 0.02), (200, 0.05)):
+        row = features("matrix", polygons=polygons, pieces=polygons + 2, error=error)
         rows.append((row, sum(truth[name] * count for name, count in row.items())))
     assert fit(rows) == pytest.approx(truth, rel=1e-6)
 
@@ -24,7 +24,7 @@ def test_a_fit_finds_the_costs_that_made_the_runs():
 def test_more_of_anything_costs_more():
     size = {"polygons": 100, "pieces": 150}
     for method in read_table():
-        seconds = [expected_seconds(method, **size, elements=n) for n in (100, 200, 400)]
+        seconds = [expected_seconds(method, **size, error=error) for error in (0.1, 0.05, 0.02)]
         assert 0 < seconds[0] < seconds[1] < seconds[2]
 
 

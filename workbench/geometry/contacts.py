@@ -77,26 +77,28 @@ def _segments(geometry: Geometry, polygon: int, pieces: NDArray[np.int64], near:
     """Segments (m, 2, 3) that some pieces leave on the inside of a polygon."""
     own = range(geometry.polygon_piece_start[polygon], geometry.polygon_piece_start[polygon + 1])
     normal, origin = geometry.polygon_normal[polygon], geometry.piece(own[0])[0]
-    made: list[FloatArray] = []
-    for piece in pieces.tolist():
-        ring = geometry.piece(piece)
-        height = (ring - origin) @ normal
-        flat = np.abs(height) <= near
-        after, ahead = np.roll(ring, -1, axis=0), np.roll(height, -1)
-        touching = flat & np.roll(flat, -1)
-        if touching.any():
-            edge = np.stack([ring, after], axis=1)[touching]
-            level = np.stack([height, ahead], axis=1)[touching]
-            made.append(edge - level[..., None] * normal)
-        elif height.min() < 0 < height.max():
-            crossing = (height < 0) != (ahead < 0)
-            share = height[crossing] / (height[crossing] - ahead[crossing])
-            ends = ring[crossing] + share[:, None] * (after[crossing] - ring[crossing])
-            if len(ends) == 2:
-                made.append(ends[None])
-    if not made:
-        return np.empty((0, 2, 3))
-    segments = np.concatenate(made)
+    # All corners of the pieces in one row, and where the next of each ring stands.
+    sizes = np.diff(geometry.piece_start)[pieces]
+    begin = np.cumsum(sizes) - sizes
+    which = np.repeat(np.arange(len(pieces)), sizes)
+    place = np.arange(len(which))
+    ahead = np.where(place + 1 < (begin + sizes)[which], place + 1, begin[which])
+    ring = geometry.corners[place - begin[which] + geometry.piece_start[pieces][which]]
+    height = (ring - origin) @ normal
+    flat = np.abs(height) <= near
+    touching = flat & flat[ahead]
+    level = height[:, None] * normal
+    edges = np.stack([ring - level, (ring - level)[ahead]], axis=1)[touching]
+    # A convex piece that does not touch crosses the plane along one segment.
+    cuts = (height < 0) != (height[ahead] < 0)
+    cuts &= (np.maximum.reduceat(height, begin) > 0)[which]
+    cuts &= (np.bincount(which, cuts) == 2)[which] & (np.bincount(which, touching) == 0)[which]
+    share = (height[cuts] / (height - height[ahead])[cuts])[:, None]
+    crossed = (ring[cuts] + share * (ring[ahead] - ring)[cuts]).reshape(-1, 2, 3)
+    order = np.argsort(np.concatenate([which[touching], which[cuts][::2]]), kind="stable")
+    segments = np.concatenate([edges, crossed])[order]
+    if not len(segments):
+        return segments
     frame = np.stack(plane_basis(normal))
     outline = shapely.union_all([shapely.Polygon((geometry.piece(k) - origin) @ frame.T) for k in own])
     inner = outline.buffer(-INSIDE * float(np.sqrt(outline.area)))
