@@ -619,16 +619,22 @@ class _Meshes:
             solution.record.results["level_irradiance"] = None if self.seen is None else self.seen.tolist()
             self.checkpoint(solution)
 
+        asked = run.options | {
+            "method": self.method,
+            "elements": count,
+            "tolerance": min(0.1 * finest, 0.01) / max(run.scale, 1.0),
+            "form_factor_error": min(run.care * 2.0 * finest, 0.02),
+        }
+        if self.method == "hierarchical":
+            # Links are found as well as their elements need; the points take direct light themselves.
+            del asked["form_factor_error"]
+            asked["direct_in_mesh"] = False
         return solve_once(
             self.scene,
             progress=_watched(self.progress, run, f"mesh {len(run.levels) + 1}, about {count} elements", stoppable),
             checkpoint=None if self.checkpoint is None else keep,
             resume=unfinished,
-            method=self.method,
-            elements=count,
-            tolerance=min(0.1 * finest, 0.01) / max(run.scale, 1.0),
-            form_factor_error=min(run.care * 2.0 * finest, 0.02),
-            **{name: value for name, value in run.options.items() if name != "method"},
+            **asked,
         )
 
     def compare(self, solution: Solution) -> tuple[float | None, float]:
@@ -791,7 +797,9 @@ def _refine(
     if method == "matrix":
         levels = _Patches(scene, run, progress, checkpoint)
     else:
-        kind = _Links if method == "hierarchical" else _Meshes
+        # Of many facets clusters are made: by their number, since links would open them all.
+        few = sum(surface.face_count for surface in scene.surfaces) <= MATRIX_POLYGONS
+        kind = _Links if method == "hierarchical" and few else _Meshes
         levels = kind(scene, run, method, progress, checkpoint, resume)
     count = levels.first()
     if resume is not None:
@@ -813,10 +821,13 @@ def _refine(
             best.stopped = best.stopped if run.left < 0 else "interrupted"
             return _finish(run, best, estimate, reason)
         n = solution.mesh.element_count
-        if method != "hierarchical" and run.levels and n < LEAST_GROWTH * run.levels[-1]["elements"]:
+        same = run.levels and n < LEAST_GROWTH * run.levels[-1]["elements"]
+        if same and not isinstance(levels, _Links):
             # Clusters of facets come in steps: as good as the same mesh tells nothing.
             if stuck >= MOST_STUCK:
-                return _finish(run, solution, _parts(solution, math.inf, run.scale), "no finer mesh can be made")
+                # Links with nothing left to refine know what they are off.
+                left = solution.record.errors.get("link_error_estimate", {}).get("total", math.inf)
+                return _finish(run, solution, _parts(solution, left, run.scale), "no finer mesh can be made")
             stuck, count = stuck + 1, 2 * count
             continue
         start = time.perf_counter()
