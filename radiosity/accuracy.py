@@ -735,6 +735,8 @@ class _Links(_Meshes):
             rounds=lambda each: self.rounds.append(_Seen(each.mesh.element_count, each)),
             method=self.method,
             link_error=1.0 / count,
+            # Points take direct light themselves: elements resolve it for what they reflect.
+            direct_in_mesh=any(surface.material.reflectance.any() for surface in self.scene.surfaces),
             tolerance=min(0.1 * run.target, 0.01) / max(run.scale, 1.0) if run.target > 0 else 0.001,
             **{name: value for name, value in run.options.items() if name != "method"},
         )
