@@ -20,12 +20,10 @@ __all__ = ["NOISE", "sender_samples", "unit_samples", "visible_shares", "weighte
 
 FloatArray = NDArray[np.float64]
 
-NOISE = 0.48
+NOISE = 0.52
 """Measured on a tessellated torus: K rays leave an error of NOISE K^-3/4 of a visible share."""
 SHARED_RAYS = 8192
 """More rays than these are spread over threads."""
-NET_GAIN = 0.75
-"""Four runs of a net complete each other: the whole is better than their spread says by this (measured)."""
 PRIOR = 4.0
 """Degrees of freedom for which that measurement counts in the standard error of a point."""
 
@@ -160,7 +158,7 @@ def weighted_shares(first, last, count, weights, through, share, doubt):
             spread = 0.0
             for run in range(runs):
                 spread += (seen[run] - mean * total[run]) ** 2
-            spread *= NET_GAIN * NET_GAIN * runs / (runs - 1.0) / (whole * whole)
+            spread *= runs / (runs - 1.0) / (whole * whole)
             square = (PRIOR * square + (runs - 1.0) * spread) / (PRIOR + runs - 1.0)
         # K rays that agree leave room for a blocker, or a gap, of about half a ray's width.
         doubt[i] = max(math.sqrt(square), 0.5 / rays)
