@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radiosity.form_factors._sampling import place_on_pieces
 from radiosity.mesh_choice import Divisions, like_elements
-from radiosity.patches import PatchMesh, build_mesh
+from radiosity.patches import TESSELLATED, PatchMesh, build_mesh
 from radiosity.sensors import Gatherer
 from radiosity.solve_costs import expected_seconds
 from radiosity.solvers.solution import Checkpoint, Progress, ProgressEvent, Solution
@@ -430,7 +430,9 @@ def _method(scene: Scene, run: _Run) -> str:
     rough = _first_error(run) >= LINKS_ERROR and run.options.get("bundles", "receiver") == "receiver"
     if polygons <= MATRIX_POLYGONS:
         run.choices["method"] = f"matrix: {polygons} polygons, all form factors at once up to {MATRIX_POLYGONS}"
-        if rough and polygons:
+        # Of rounded surfaces links are clusters, which say far more of their error than they make.
+        rounded = any(surface.face_count >= TESSELLATED for surface in scene.surfaces)
+        if rough and polygons and not rounded:
             pieces, error = len(Geometry.from_scene(scene).piece_start) - 1, _first_error(run)
             whole, links = (
                 expected_seconds(each, polygons=polygons, pieces=pieces, error=error)

@@ -35,7 +35,7 @@ LEAST_TOUCHING = 0.2
 COARSE_CLUSTERS = 12
 """Least number of cubes over a tessellated surface, however coarse the mesh."""
 
-__all__ = ["Extents", "PatchMesh", "build_mesh", "edge_scales", "forecast_elements"]
+__all__ = ["TESSELLATED", "Extents", "PatchMesh", "build_mesh", "edge_scales", "forecast_elements"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
