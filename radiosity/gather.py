@@ -86,9 +86,8 @@ SPACING, SPACED_FOR = 0.5, 0.02
 smaller one; as the root of the error beyond, for interpolation errs as the square of the step."""
 PILOT_RAYS = (16, 128)
 """Rays of a bundle before it is known how many are needed: as many as 0.03 of error needs, within these."""
-NODE_ERROR = (1.5, 1.0)
-"""Standard error of a node, as a share of the picture's error: a fit averages over a few nodes.  The second on the
-finest lattice, where nodes often stand alone."""
+NODE_ERROR = 1.0
+"""Standard error of a node, as a share of the picture's error: a fit averages over a few nodes."""
 INSIDE_TURN = 12.0
 """Second difference of all light between pixels, relative to what the pixel shows and as a multiple of the error, from
 which indirect light is gathered at several places inside the pixel."""
@@ -370,7 +369,7 @@ class PictureGatherer:
     def _checking(self) -> PictureGatherer:
         """One that draws single pixels with more care, and looks where hits read the solution at what is true there."""
         other = copy.copy(self)
-        other.options = replace(self.options, error=CHECK_SHARE / NODE_ERROR[True] * self.options.error, rays=None)
+        other.options = replace(self.options, error=CHECK_SHARE / NODE_ERROR * self.options.error, rays=None)
         other.seed = self.seed + 104_729
         if isinstance(self.gatherer, Gatherer):
             other.gatherer = self.gatherer.doubting()
@@ -1020,12 +1019,11 @@ class _Tile:
     # ---- indirect light -------------------------------------------------------------------------
 
     def _bundles(
-        self, fragments: _Fragments, rows: IntArray, direct: FloatArray, *, places: int = 1, alone: bool = True
+        self, fragments: _Fragments, rows: IntArray, direct: FloatArray, places: int = 1
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """What nodes hold (n, 2 bands), its standard error, and harmonic mean distance (n,) of some fragments.
 
-        ``direct`` (n, bands) is their direct light.  Of so many ``places`` the mean is as good as a node that stands
-        ``alone`` for its pixel.
+        ``direct`` (n, bands) is their direct light.  Of so many ``places`` the mean is as good as a node.
         """
         where = (fragments.points[rows], fragments.normals[rows])
         gatherer = self.owner.gatherer
@@ -1040,8 +1038,8 @@ class _Tile:
             if places > 1:
                 pilot = max(2 * pilot // places, PILOT_RAYS[0])
             found = gatherer.indirect(
-                *where, rays=pilot, counters=self.counters,
-                error=NODE_ERROR[alone] * math.sqrt(places) * self.options.error, direct=direct, seed=seed,
+                *where, rays=pilot, counters=self.counters, error=NODE_ERROR * math.sqrt(places) * self.options.error,
+                direct=direct, seed=seed,
             )  # fmt: skip
         spread = np.concatenate([found.standard_error, found.standard_error], axis=1)
         return np.concatenate([found.indirect, found.sky], axis=1), spread, found.distance
@@ -1072,7 +1070,7 @@ class _Tile:
             flagged = np.zeros(0, dtype=np.int64)
             if len(rows):
                 foretold = near.between(everywhere[rows], self.owner.workers)
-                found, spread, distance = self._bundles(fragments, rows, direct[rows], alone=pitch == 1)
+                found, spread, distance = self._bundles(fragments, rows, direct[rows])
                 whole = direct[rows] + found[:, : self.owner.bands]
                 total = np.concatenate([whole, whole + found[:, self.owner.bands :]], axis=1)
                 off = np.abs(np.where(np.isfinite(foretold), foretold, found) - found) - NOISE * spread
