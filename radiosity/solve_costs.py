@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from workbench.errors import InputError
 
@@ -48,6 +47,8 @@ def features(method: str, *, polygons: int, pieces: int, error: float) -> dict[s
 
 def fit(rows: Sequence[tuple[Mapping[str, float], float]]) -> dict[str, float]:
     """Non-negative least squares of relative errors over (features, processor seconds) of runs of one method."""
+    from scipy.optimize import nnls  # a fifth of a second, for this alone
+
     names = list(rows[0][0])
     seconds = np.array([used for _, used in rows])
     table: NDArray[np.float64] = np.array([[row[name] for name in names] for row, _ in rows]) / seconds[:, None]
