@@ -33,6 +33,7 @@ __all__ = [
     "owen_sobol",
     "point_set",
     "r2",
+    "scrambled",
     "shifted",
     "sobol",
     "sobol_bits",
@@ -200,14 +201,19 @@ def owen_scramble(bits, seed):
 
 
 @njit(nogil=True, cache=True)
+def scrambled(bits, own, out):
+    """Points (k, 2) in [0, 1) of ``bits`` (k, 2), each axis scrambled by its half of the 64 bits ``own``."""
+    for axis in range(2):
+        digits = np.uint32((own >> np.uint64(32 * axis)) & np.uint64(0xFFFFFFFF))
+        for k in range(bits.shape[0]):
+            # The middle of the 2^-32 that the 32 digits leave open.
+            out[k, axis] = (np.float64(owen_scramble(bits[k, axis], digits)) + 0.5) * 2.0**-32
+
+
+@njit(nogil=True, cache=True)
 def _owen(bits, first, seed, out):
     for row in range(out.shape[0]):
-        h = hashed(first + row, seed)
-        for axis in range(2):
-            own = np.uint32((h >> np.uint64(32 * axis)) & np.uint64(0xFFFFFFFF))
-            for k in range(bits.shape[0]):
-                # The middle of the 2^-32 that the 32 digits leave open.
-                out[row, k, axis] = (np.float64(owen_scramble(bits[k, axis], own)) + 0.5) * 2.0**-32
+        scrambled(bits, hashed(first + row, seed), out[row])
 
 
 @njit(nogil=True, cache=True)

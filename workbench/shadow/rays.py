@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workbench.accel.embree import BLOCK_RAYS, EmbreeAccelerator
-from workbench.sampling.sequences import hashed, owen_scramble, sobol_bits
+from workbench.sampling.sequences import hashed, scrambled, sobol_bits
 
 __all__ = ["NOISE", "sender_samples", "unit_samples", "visible_shares", "weighted_shares"]
 
@@ -47,18 +47,9 @@ def sender_samples(ring: FloatArray, unit: FloatArray) -> FloatArray:
 
 
 @njit(nogil=True, cache=True)
-def _scrambled(bits, own, out):
-    for axis in range(2):
-        digits = np.uint32((own >> np.uint64(32 * axis)) & np.uint64(0xFFFFFFFF))
-        for k in range(out.shape[0]):
-            # The middle of the 2^-32 that the 32 digits leave open.
-            out[k, axis] = (np.float64(owen_scramble(bits[k, axis], digits)) + 0.5) * 2.0**-32
-
-
-@njit(nogil=True, cache=True)
 def _fill(bits, index, seed, out):
     for row in range(out.shape[0]):
-        _scrambled(bits, hashed(index[row], seed), out[row])
+        scrambled(bits, hashed(index[row], seed), out[row])
 
 
 def unit_samples(index: NDArray[np.int64], count: int, seed: int) -> FloatArray:
@@ -87,7 +78,7 @@ def _make_rays(
             parallelogram = False
     row = 0
     for i in range(first, last):
-        _scrambled(bits, hashed(index[i], seed), unit)
+        scrambled(bits, hashed(index[i], seed), unit)
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         sx, sy, sz = px + offset * nx, py + offset * ny, pz + offset * nz
