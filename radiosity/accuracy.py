@@ -598,10 +598,29 @@ class _Meshes:
         self.unfinished = resume
         self.gatherer: Gatherer | None = None
         self.points: tuple[FloatArray, FloatArray, IntArray] | None = None
-        self.seen: FloatArray | None = None
-        stored = None if resume is None else resume.record.results.get("level_irradiance")
-        if stored is not None:
-            self.seen = np.asarray(stored)
+        self.take_up({} if resume is None else resume.record.results)
+
+    def take_up(self, results: dict[str, Any]) -> None:
+        """What a run that goes on has seen, from the results of its record."""
+        stored = results.get("level_irradiance")
+        self.seen: FloatArray | None = None if stored is None else np.asarray(stored)
+
+    def put_by(self) -> dict[str, Any]:
+        """The results from which :meth:`take_up` goes on."""
+        return {"level_irradiance": None if self.seen is None else self.seen.tolist()}
+
+    def _keeper(self, count: int) -> Checkpoint | None:
+        """Saves an unfinished solve of ``count`` with what a run needs to go on, if it is to be saved."""
+        save, run = self.checkpoint, self.run
+        if save is None:
+            return None
+
+        def keep(solution: Solution) -> None:
+            solution.record.settings |= run.settings | {"elements": count}
+            solution.record.results |= {"levels": run.levels} | self.put_by()
+            save(solution)
+
+        return keep
 
     def first(self) -> int:
         """Number of elements of the first mesh, which shows nothing before there is another."""
@@ -613,14 +632,6 @@ class _Meshes:
         run = self.run
         finest = max(run.target, 0.3 / count)
         unfinished, self.unfinished = self.unfinished, None
-
-        def keep(solution: Solution) -> None:
-            assert self.checkpoint is not None
-            solution.record.settings |= run.settings | {"elements": count}
-            solution.record.results["levels"] = run.levels
-            solution.record.results["level_irradiance"] = None if self.seen is None else self.seen.tolist()
-            self.checkpoint(solution)
-
         asked = run.options | {
             "method": self.method,
             "elements": count,
@@ -634,7 +645,7 @@ class _Meshes:
         return solve_once(
             self.scene,
             progress=_watched(self.progress, run, f"mesh {len(run.levels) + 1}, about {count} elements", stoppable),
-            checkpoint=None if self.checkpoint is None else keep,
+            checkpoint=self._keeper(count),
             resume=unfinished,
             **asked,
         )
@@ -699,18 +710,14 @@ class _Links(_Meshes):
     The ``count`` of this class is the inverse of the link error.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        run: _Run,
-        method: str,
-        progress: Progress | None,
-        checkpoint: Checkpoint | None,
-        resume: Solution | None,
-    ) -> None:
-        super().__init__(scene, run, method, progress, checkpoint, resume)
-        stored = [] if resume is None else resume.record.results.get("rounds_seen", [])
+    def take_up(self, results: dict[str, Any]) -> None:
+        """As of meshes: what was seen of rounds."""
+        stored = results.get("rounds_seen", [])
         self.rounds = [_Seen(e["elements"], None, np.asarray(e["looks"]), np.asarray(e["surfaces"])) for e in stored]
+
+    def put_by(self) -> dict[str, Any]:
+        """As of meshes."""
+        return {"rounds_seen": [self._seen(each).as_dict() for each in self.rounds]}
 
     def first(self) -> int:
         """Inverse of the first link error."""
@@ -721,18 +728,10 @@ class _Links(_Meshes):
         """Refine until links are off by no more than the inverse of ``count``."""
         run = self.run
         unfinished, self.unfinished = self.unfinished, None
-
-        def keep(solution: Solution) -> None:
-            assert self.checkpoint is not None
-            solution.record.settings |= run.settings | {"elements": count}
-            solution.record.results["levels"] = run.levels
-            solution.record.results["rounds_seen"] = [self._seen(each).as_dict() for each in self.rounds]
-            self.checkpoint(solution)
-
         solution = solve_once(
             self.scene,
             progress=_watched(self.progress, run, f"mesh {len(run.levels) + 1}, links to {1 / count:.2g}", stoppable),
-            checkpoint=None if self.checkpoint is None else keep,
+            checkpoint=self._keeper(count),
             resume=unfinished,
             rounds=lambda each: self.rounds.append(_Seen(each.mesh.element_count, each)),
             method=self.method,
